@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.prepare.camera_array import CameraArray
+from gsgan.prepare.frontier import Outline
 from gsgan.prepare.options import Options
 from gsgan.prepare.solve import SolveSettings
 
@@ -55,6 +56,25 @@ def turned(
     R, t = cameras.R.copy(), cameras.t.copy()
     R[camera], t[camera] = turn @ R[camera], turn @ t[camera] + [metres, 0, 0]
     return CameraArray(cameras.K, R, t)
+
+
+def outlines(uv: np.ndarray, noise: float = 0.0) -> list[list[Outline | None]]:
+    """Silhouettes ``[C][F]`` of the convex hulls of points that are seen at ``uv [C, F, J, 2]``."""
+    rng = np.random.default_rng(1)
+    result = []
+    for camera in uv:
+        own: list[Outline | None] = []
+        for points in camera:
+            hull = cv2.convexHull(points.astype(np.float32))[:, 0]
+            moved = hull + noise * rng.standard_normal(hull.shape)
+            own.append(Outline(moved, np.zeros(len(hull), bool)))
+        result.append(own)
+    return result
+
+
+def no_outlines(C: int, F: int) -> list[list[Outline | None]]:
+    """No silhouette of any camera in any frame."""
+    return [[None] * F for _ in range(C)]
 
 
 # ------------------------------------------------ calibration files, as other tools write them
@@ -138,7 +158,7 @@ def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
 def options(project: Path, **more) -> Options:
     """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
-        "solve": SolveSettings(refinements=0),
+        "solve": SolveSettings(refinements=0, body=False),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),

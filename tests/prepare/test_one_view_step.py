@@ -9,19 +9,21 @@ from one_person import turning, world_landmarks
 
 from gsgan.body.solve import FLOOR, below_minimum
 from gsgan.fit.shape import shape_of
-from gsgan.prepare.one_view import (
+from gsgan.prepare.body_problem import (
     ACCELERATION,
     ACCELERATIONS,
-    FOOT_JOINTS,
     MAX_TIME_GAP,
     OUTLIER,
+    State,
+)
+from gsgan.prepare.one_view import (
+    FOOT_JOINTS,
     PLANE,
     RESIDUAL_GROUPS,
     SLIDING,
     ZOOMS,
     Problem,
     Seen,
-    State,
     _best_zoom,
 )
 
@@ -135,7 +137,7 @@ def dense_step(
             stop.sqrt() * (amount + dq),
             FLOOR**0.5 * dq,
             problem.prior.sqrt() * shared,
-            problem.too_large(shared[PLANE:])[None],
+            problem.size_error(shared[PLANE:])[None],
         ]
         if problem.smooth:
             parts += [

@@ -32,7 +32,8 @@ def project(tmp_path):
 
 
 def test_videos_become_a_capture_that_training_reads(project):
-    out = prepare(options(project, solve=SolveSettings()), quiet())
+    settings = SolveSettings(body=False)
+    out = prepare(options(project, solve=settings), quiet())
     layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))
@@ -47,11 +48,26 @@ def test_videos_become_a_capture_that_training_reads(project):
     assert not layout.cameras["cam01"].distorted
     given = json.loads((project / "cameras.json").read_text())["cam01"]
     np.testing.assert_allclose(layout.cameras["cam01"].K, given["K"])
-    hands = np.load(
-        out / "hands3d.npz"
-    )  # no hands were given: there, and missing
-    assert np.isnan(hands["p"]).all()
-    assert (hands["conf"] == 0).all()
+    # No hands and no face were given.
+    assert not (out / "hands3d.npz").exists()
+    assert not (out / "face3d.npz").exists()
+
+
+def test_joints_that_no_two_cameras_see_are_inferred_and_marked(project):
+    def hide(arrays):
+        arrays["conf"][2, [13, 27]] = 0
+
+    for path in sorted((project / "pose").iterdir())[:2]:
+        edit_npz(path, hide)
+    out = prepare(options(project, solve=SolveSettings()), quiet())
+    found = np.load(out / "landmarks3d.npz")
+    assert np.isfinite(found["p"]).all()
+    assert not found["seen"][2, [13, 27]].any()
+    assert found["seen"].sum() == found["seen"].size - 2
+    np.testing.assert_allclose(found["conf"][2, [13, 27]], 0.1)
+    error = np.linalg.norm(found["p"] - skeletons(FRAMES), axis=-1)
+    assert np.median(error) < 0.01
+    assert error[2, [13, 27]].max() < 0.05
 
 
 def test_the_numbers_have_every_stage_and_the_dataset_is_checked(

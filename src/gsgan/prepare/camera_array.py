@@ -26,6 +26,8 @@ MAX_EVALUATIONS = 30  # of the optimiser
 LOSS_SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 # relative change of the cost at which the refinement ends
 COST_TOLERANCE = 1e-7
+# Standard deviations of the priors above which a camera's move counts linearly for the world.
+WORLD_LOSS = 0.02
 # Square pixels: keeps the residual's scaling finite at an error of 0.
 MIN_SQUARE = 1e-12
 
@@ -242,8 +244,11 @@ def refine_cameras(
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))
 
-    # Seven numbers: three of a turn, three of a move, and the scale.
-    world = least_squares(world_priors, np.zeros(7))
+    # Seven numbers: three of a turn, three of a move, and the scale. The loss is nearly linear, so
+    # that a few cameras that moved do not take the world with them.
+    world = least_squares(
+        world_priors, np.zeros(7), loss="soft_l1", f_scale=WORLD_LOSS
+    )
     return _similar(cameras, world.x)
 
 

@@ -71,6 +71,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         return {
             "p": p[:, part].astype(np.float32),
             "conf": solution.conf[:, part].astype(np.float32),
+            "seen": solution.seen[:, part],
             "frame_id": outcome.frames,
             "names": np.array(joint_names()[part]),
         }
@@ -86,11 +87,13 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
     )
 
-    # Hands and face, if the detections have them.
-    if options.hands and p.shape[1] > BODY:
-        write_npz(root / "hands3d.npz", **landmarks(HANDS))
-    if options.face and p.shape[1] > BODY:
-        write_npz(root / "face3d.npz", **landmarks(FACE))
+    # Hands and face, if any frame has them.
+    for wanted, name, part in (
+        (options.hands, "hands3d.npz", HANDS),
+        (options.face, "face3d.npz", FACE),
+    ):
+        if wanted and known(p[:, part]).any():
+            write_npz(root / name, **landmarks(part))
 
     # The facts that a reader needs, and the key of the settings.
     meta = {
@@ -99,6 +102,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
+        **({"background": "black"} if options.mattes else {}),
         "made_by": {
             "generator": MADE_BY,
             "version": gsgan.__version__,

@@ -11,6 +11,7 @@ import numpy as np
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.pixels import read_mask_values
+from gsgan.prepare.matting import Room, cut_out, tidy
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
 from gsgan.utils.arrays import Bytes
@@ -18,8 +19,6 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 from gsgan.utils.frame_files import frame_files, last_number
 
-# share of the largest piece of a mask: smaller ones are removed
-MIN_BLOB = 0.02
 JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
@@ -71,24 +70,6 @@ def _first_number(stem: str) -> int:
     return int(stem.partition("_")[0])
 
 
-def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
-    """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
-    # The levels, by a table of all values.
-    low = 255 * levels[0]
-    high = 255 * levels[1]
-    share = np.clip((np.arange(256) - low) / (high - low), 0, 1)
-    table = np.round(255 * share).astype(np.uint8)
-    mask = np.asarray(cv2.LUT(mask, table), np.uint8)
-
-    # Pieces that are too small against the largest one.
-    covered = (mask > 0).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(covered)
-    areas = stats[:, cv2.CC_STAT_AREA].copy()
-    areas[0] = 0  # the background
-    large = areas >= MIN_BLOB * areas.max()
-    return mask * large[labels]
-
-
 def write_images(
     root: Path,
     camera: CameraEntry,
@@ -99,6 +80,7 @@ def write_images(
     scale: float,
     suffix: str,
     levels: tuple[float, float],
+    room: Room | None,
     advance: Advance,
 ) -> list[int]:
     """Writes images/{camera}/%06d and masks/{camera}/%06d.png.
@@ -113,6 +95,7 @@ def write_images(
         scale: of images and masks.
         suffix: of the images; masks are always png.
         levels: alpha that becomes 0 and 1.
+        room: in which the person is cut out; None writes images and masks as they are.
         advance: called for each frame.
 
     Returns:
@@ -160,6 +143,8 @@ def write_images(
         written.append(frame)
         advance(len(written), len(frames))
         mask = tidy(read_mask_values(masks[number]), levels)
+        if room is not None and mask.shape == image.shape[:2]:
+            image, mask = cut_out(image, mask, room)
         write(images / f"{frame:06d}.{suffix}", image, number, source.path)
         write(alphas / f"{frame:06d}.png", mask, number, masks[number])
     return written
@@ -169,7 +154,13 @@ def _write(path: Path, pixels: Bytes) -> None:
     """Writes an image in place: a run that was killed here writes all of them again."""
     options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
     if path.suffix == ".jpg":
-        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        # Colours keep their resolution: the outline is sharp.
+        options = [
+            cv2.IMWRITE_JPEG_QUALITY,
+            JPEG_QUALITY,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+        ]
     _, encoded = cv2.imencode(path.suffix, pixels, options)
     with writing(path):
         path.write_bytes(encoded.tobytes())

@@ -170,6 +170,7 @@ def solve_video(
         cameras=CameraArray.of([camera]),
         p=joints,
         conf=np.where(np.isfinite(joints).all(-1), seen.conf[:, :J], 0.0),
+        seen=seen.conf[:, :J] > 0,
         error=error,
         flips=np.zeros((1, F, len(FLIP_GROUPS) + 1), bool),
         left_out=np.zeros((1, F, 2), bool),
@@ -177,6 +178,7 @@ def solve_video(
         gain=np.full(1, np.nan),
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
+        frontier=(np.nan, np.nan),
     )
 
     # The numbers and notes of the report.

@@ -77,6 +77,7 @@ class Options:
     mediapipe: MediaPipe = field(default_factory=MediaPipe)
     solve: SolveSettings = field(default_factory=SolveSettings)
     mask_levels: tuple[float, float] = (0.3, 0.8)
+    matting: bool = True
     scale: float = 1.0
     format: str = "jpg"
 
@@ -157,6 +158,11 @@ class Options:
     def needs_tool(self) -> bool:
         """Whether the MediaPipe tool has to run."""
         return MEDIAPIPE in (self.landmarks, self.masks)
+
+    @property
+    def mattes(self) -> bool:
+        """Whether the person is cut out of the estimated room: given masks stay as they are."""
+        return self.matting and self.masks == MEDIAPIPE
 
     @property
     def one_camera(self) -> bool:

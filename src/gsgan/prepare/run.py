@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
+from gsgan.data.pixels import read_mask_values
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
@@ -30,8 +31,10 @@ from gsgan.prepare.dataset import (
     write_files,
 )
 from gsgan.prepare.from_person import calibrate_from_person
+from gsgan.prepare.frontier import find_outlines
 from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
+from gsgan.prepare.matting import Room, Studied, study_room, tidy
 from gsgan.prepare.mediapipe import find_people, tool_key
 from gsgan.prepare.one_camera import solve_video
 from gsgan.prepare.one_view import USUAL_HEIGHT
@@ -43,15 +46,16 @@ from gsgan.prepare.options import (
     read_inputs,
 )
 from gsgan.prepare.solve import Solution, median, solve
-from gsgan.prepare.sources import stamp
+from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
-from gsgan.skeleton.joints import BODY, FACE, HANDS, known
-from gsgan.utils.arrays import Float, Ints
+from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
+from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
 
+STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
@@ -109,9 +113,32 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
             "file": inputs.calibration.path.name,
             "format": inputs.calibration.format,
         },
-        "notes": [*inputs.notes, *_late_clocks(solution, inputs.sources)],
+        "frontier_px": dict(
+            zip(("given", "refined"), solution.frontier, strict=True)
+        ),
+        "notes": [
+            *inputs.notes,
+            *_camera_notes(solution, turned),
+            *_late_clocks(solution, inputs.sources),
+        ],
         "settings": outcome.options.record(),
     }
+
+
+def _camera_notes(solution: Solution, turned: Float) -> list[str]:
+    """A note on whether the cameras were refined, and why."""
+    given, refined = solution.frontier
+    if not np.isfinite(given):
+        return []
+    if turned.any():
+        return [
+            f"the cameras were refined: silhouettes of two cameras now agree within {refined:.2f} "
+            f"pixels (median), with the given calibration {given:.2f}"
+        ]
+    return [
+        f"the given calibration was kept: silhouettes of two cameras agree within {given:.2f} "
+        f"pixels (median), refined {refined:.2f}"
+    ]
 
 
 def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
@@ -187,7 +214,7 @@ def _number(value: float, form: str) -> str:
 
 
 # incremented when the same settings begin to give another result
-STAGE_VERSION = 6
+STAGE_VERSION = 7
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -226,6 +253,7 @@ def prepare(options: Options, console: Console) -> Path:
         masks = filmed.masks
         frames = filmed.frames
         solution = filmed.solution
+        rooms = _silhouettes(options, inputs.sources, masks).rooms
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
     else:
@@ -239,14 +267,20 @@ def prepare(options: Options, console: Console) -> Path:
             inputs = _from_person(options, inputs, frames, uv, conf, console)
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
-        solution = _solved(options, inputs, frames, uv, conf, console)
+        silhouettes = _silhouettes(options, inputs.sources, masks)
+        rooms = silhouettes.rooms
+        solution = _solved(
+            options, inputs, frames, uv, conf, silhouettes.alphas, console
+        )
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)
 
     # The dataset appears at once, when it is complete.
-    written = _write_images(options, inputs, masks, frames, solution, root)
+    written = _write_images(
+        options, inputs, masks, rooms, frames, solution, root
+    )
     outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
     numbers = summarise(outcome) | extra
@@ -466,12 +500,68 @@ def _in_metres(
     return replace(inputs, cameras=cameras, notes=[*inputs.notes, note])
 
 
+class Silhouettes(NamedTuple):
+    """The empty room of each camera, None for masks that are given, and the person's alpha."""
+
+    rooms: dict[str, Room | None]
+    alphas: dict[str, dict[int, Bytes]]  # by the camera's own frame number
+
+
+def _silhouettes(
+    options: Options,
+    sources: Mapping[str, Recording],
+    masks: Mapping[str, Mapping[int, Path]],
+) -> Silhouettes:
+    """The rooms, and alpha in some frames that all cameras have, evenly spaced.
+
+    Raises:
+        DataError: when no frame has a mask in every camera.
+    """
+    # Frames by their common numbers, and by each camera's own.
+    offsets = options.offsets or {}
+    shared = set.intersection(
+        *({n + offsets.get(name, 0) for n in masks[name]} for name in sources)
+    )
+    if options.frames is not None:
+        shared &= set(parse_frames(options.frames, "frames"))
+    if not shared:
+        raise DataError(
+            f"{options.folder('source')}: no frame has a mask in every camera; do frame numbers "
+            "agree?"
+        )
+    frames = sorted(shared)
+    chosen = [frames[k] for k in evenly_spaced(len(frames), STUDIED)]
+
+    # A matte of a room that stands still, or the given masks.
+    def study(name: str, advance: Advance) -> Studied:
+        own = [frame - offsets.get(name, 0) for frame in chosen]
+        advance(0, 1)
+        if options.mattes:
+            return study_room(
+                sources[name], masks[name], own, options.mask_levels
+            )
+        alphas = {}
+        for number in own:
+            mask = read_mask_values(masks[name][number])
+            alphas[number] = tidy(mask, options.mask_levels)
+        return Studied(None, alphas)
+
+    studied = each_camera(
+        study, "estimating the room", list(sources), options.workers
+    )
+    return Silhouettes(
+        rooms={name: one.room for name, one in studied.items()},
+        alphas={name: one.alphas for name, one in studied.items()},
+    )
+
+
 def _solved(
     options: Options,
     inputs: Inputs,
     frames: Ints,
     uv: Float,
     conf: Float,
+    alphas: Mapping[str, Mapping[int, Bytes]],
     console: Console,
 ) -> Solution:
     """The joints and cameras that fit undistorted pixels, see `_undistorted`."""
@@ -481,8 +571,18 @@ def _solved(
     flat_uv = uv.reshape(C, -1, 2)
     p = plain(cameras, flat_uv, conf.reshape(C, -1))
     _check_distance(inputs, p)
+    offsets = options.offsets or {}
+    numbers = {name: frames - offsets.get(name, 0) for name in inputs.sources}
+    outlines = find_outlines(inputs.cameras, alphas, numbers)
     with console.status("finding 3D joints and refining the cameras"):
-        return solve(cameras, frames / inputs.fps, uv, conf, options.solve)
+        return solve(
+            cameras=cameras,
+            time=frames / inputs.fps,
+            uv=uv,
+            conf=conf,
+            outlines=outlines,
+            settings=options.solve,
+        )
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:
@@ -501,13 +601,15 @@ def _write_images(
     options: Options,
     inputs: Inputs,
     masks: Mapping[str, Mapping[int, Path]],
+    rooms: Mapping[str, Room | None],
     frames: Ints,
     solution: Solution,
     root: Path,
 ) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
-    # Frames without a joint of the body are left out.
-    has_joint = known(solution.p[:, :BODY]).any(1)
+    # Frames without a joint of the body are left out; hands and a face alone are no person.
+    body = [joint for joint in range(BODY) if joint not in FROM_PARTS]
+    has_joint = known(solution.p[:, body]).any(1)
     posed = set(frames[has_joint].tolist())
     if not posed:
         raise DataError(
@@ -529,6 +631,7 @@ def _write_images(
             scale=options.scale,
             suffix=options.format,
             levels=options.mask_levels,
+            room=rooms[name],
             advance=advance,
         )
 

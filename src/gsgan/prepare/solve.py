@@ -1,8 +1,11 @@
 """From 2D detections to 3D joints and refined cameras, with the error after every stage."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from gsgan.prepare.camera_array import (
     MIN_VIEWS,
@@ -11,6 +14,8 @@ from gsgan.prepare.camera_array import (
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.frontier import Outline, frontier_points
+from gsgan.prepare.many_views import Views, solve_views
 from gsgan.prepare.sides import (
     FLIP_GAIN,
     apply_flips,
@@ -28,19 +33,27 @@ from gsgan.skeleton.joints import (
     ALL,
     BODY,
     FLIP_GROUPS,
+    FROM_PARTS,
     HAND_PAIRS,
     HANDS,
     WRIST_JOINTS,
     known,
 )
-from gsgan.utils.arrays import Bool, Float, Ints, evenly_spaced, nanmedian
+from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 from gsgan.utils.checks import above, at_least, whole
 
 # Errors and distances are in thousandths of the focal length.
 WRIST_SCALE = 40.0  # distance from the pose's wrist at which a hand counts half
 MAX_HAND_ERROR = 20.0  # maximum median error of a detected hand
 OWN_PAIRS = tuple((j, j + HAND) for j in range(len(HAND_PAIRS)))
-REFINED = 200  # maximum number of frames that refine the cameras, evenly spaced
+# Weight of a landmark against a frontier point: landmarks are many, and off in the same direction.
+LANDMARK_WEIGHT = 0.01
+MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
+# Refined cameras are taken if silhouettes are nearer to epipolar lines than this share of their
+# distance with the given ones, in frames that took no part.
+BETTER = 0.9
+INFERRED = 0.1  # confidence of a joint that no two cameras see, but a body has
+SHOULDERS = [11, 12]
 LAG = 6  # frames by which clocks are compared, either way
 
 
@@ -106,16 +119,20 @@ class SolveSettings:
     """Settings of the solution, see conf/prepare.yaml."""
 
     min_confidence: float = 0.1  # of a detection
-    refinements: int = 2  # number of rounds
+    refinements: int = 3  # number of rounds
     rotation_prior: float = 2.0  # standard deviation, degrees
     position_prior: float = 0.05  # standard deviation, metres
     smoothing: float = 0.02  # seconds
+    body: bool = True  # joints are those of one body in smooth motion
+    # standard deviation of a landmark, thousandths of the focal length
+    noise: float = 2.0
 
     def __post_init__(self) -> None:
         whole("solve.refinements", self.refinements, 0)
         above("solve.rotation_prior", self.rotation_prior)
         above("solve.position_prior", self.position_prior)
         at_least("solve.smoothing", self.smoothing, 0)
+        above("solve.noise", self.noise)
 
 
 @dataclass(frozen=True)
@@ -124,8 +141,10 @@ class Solution:
 
     cameras: CameraArray  # refined
     p: Float  # [F, J, 3] metres
-    # [F, J] mean confidence of the cameras that see the joint, 0 where missing
+    # [F, J] mean confidence of the cameras that see the joint, `INFERRED` where the body alone says
+    # where it is, 0 where missing
     conf: Float
+    seen: Bool  # [F, J] whether the joint came from detections
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
     # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
     flips: Bool
@@ -134,6 +153,8 @@ class Solution:
     gain: Float  # [C] of correcting that clock
     # name of each stage and its body errors [C, F, 33]
     stages: dict[str, Float]
+    # median distance of silhouettes from epipolar lines, pixels: given cameras, refined ones
+    frontier: tuple[float, float]
     removed: dict[str, int]  # number of joints removed, by reason
 
     @property
@@ -163,9 +184,10 @@ def solve(
     time: Float,
     uv: Float,
     conf: Float,
+    outlines: Sequence[Sequence[Outline | None]],
     settings: SolveSettings,
 ) -> Solution:
-    """All stages: plain, robust, flips, refined, smoothed.
+    """All stages: plain, robust, flips, refined, body.
 
     Args:
         cameras: as calibrated.
@@ -173,6 +195,7 @@ def solve(
         uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 105 with hands
             and face.
         conf: ``[C, F, J]`` 0 = not seen.
+        outlines: of the silhouettes of each camera in each frame; they judge the cameras.
         settings: of every stage.
     """
     # Errors are in pixels of cameras of one focal length.
@@ -193,19 +216,32 @@ def solve(
     # Swapped sides first: they would bend the cameras.
     found = correct(cameras, scaled, weight, time)
     stages["flips"] = found.points.error
-    cameras, found = _refined(cameras, scaled, weight, time, found, settings)
+    refined = refine(given, found, outlines, settings)
+    if refined.cameras is not given:
+        cameras, _ = refined.cameras.normalised(uv)
+        found = correct(cameras, scaled, weight, time)
     stages["refined"] = found.points.error
 
-    # Remove impossible joints and smooth the rest.
+    # Impossible joints are removed; joints of hands and face, or all, are smoothed.
     p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
     final_weight = found.points.weight.reshape(conf.shape)
     agreed = _mean_seen(final_weight, found.weight)
-    p = smooth(p, agreed, time, settings.smoothing)
+    smoothed = smooth(p, agreed, time, settings.smoothing)
+
+    # A body in smooth motion, from the views of all cameras.
+    seen = known(p)
+    if settings.body and seen[:, SHOULDERS].all(1).any():
+        smoothed[:, :BODY] = body_joints(
+            cameras, found.uv, found.weight, p, time, settings.noise
+        )
+    p = smoothed
+    conf_seen = _mean_seen(found.weight, found.weight)
+    inferred = np.where(known(p), INFERRED, 0.0)
 
     # The final errors, of detections that were used.
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv))
     error = np.where(found.weight > 0, error.reshape(conf.shape), np.nan)
-    stages["smoothed"] = error
+    stages["body" if settings.body else "smoothed"] = error
 
     # Errors by stage are those of the body, in pixels of each camera.
     stages_in_pixels = {}
@@ -221,7 +257,8 @@ def solve(
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
-        conf=np.where(known(p), _mean_seen(found.weight, found.weight), 0.0),
+        conf=np.where(seen & known(p), conf_seen, inferred),
+        seen=seen,
         error=error * to_pixels,
         flips=found.flips,
         left_out=found.left_out,
@@ -229,38 +266,77 @@ def solve(
         gain=gain,
         stages=stages_in_pixels,
         removed=removed,
+        frontier=refined.frontier,
     )
 
 
-def _refined(
-    start: CameraArray,
-    uv: Float,
-    weight: Float,
-    time: Float,
-    found: Corrected,
-    settings: SolveSettings,
-) -> tuple[CameraArray, Corrected]:
-    """Refines the cameras and triangulates again, in turn."""
-    # Some frames are enough for the cameras; each round begins with better points.
-    cameras = start
-    F = weight.shape[1]
-    at = np.array(evenly_spaced(F, REFINED, ends=True))
+class Refined(NamedTuple):
+    """Cameras after the refinement, and what silhouettes say of them."""
 
-    # The prior pulls towards the given cameras, not towards those of the last
-    # round.
+    cameras: CameraArray
+    # median distance of silhouettes from epipolar lines, pixels: given cameras, refined ones
+    frontier: tuple[float, float]
+
+
+def refine(
+    given: CameraArray,
+    found: Corrected,
+    outlines: Sequence[Sequence[Outline | None]],
+    settings: SolveSettings,
+) -> Refined:
+    """The given cameras, or refined ones where silhouettes show that these are better.
+
+    A given calibration is evidence: detectors are wrong in the same direction in thousands of
+    landmarks, which fit best if cameras move. Cameras are refined by frontier points, and by
+    landmarks with little weight, in every other frame; the frames between decide.
+
+    Args:
+        given: ``C`` cameras.
+        found: landmarks of F frames, seen by these cameras.
+        outlines: of each camera in each frame.
+        settings: number of rounds, and the priors.
+    """
+    # Every other of the frames with outlines, and the frames between.
+    some = [
+        f for f, frame in enumerate(zip(*outlines, strict=True)) if any(frame)
+    ]
+    fitted = [[one[f] for f in some[::2]] for one in outlines]
+    judging = [[one[f] for f in some[1::2]] for one in outlines]
+    before = frontier_points(given, judging)
+    error = float(np.nanmedian(before.error)) if before.uv.size else np.nan
+    if settings.refinements == 0 or before.uv.shape[1] < MIN_FRONTIER:
+        return Refined(given, (error, error))
+
+    # Landmarks of the body in the same frames; pixels are those of one focal length.
+    at = np.array(some[::2])
+    to_unit = (UNIT_FOCAL / given.focal)[:, None, None]
+    landmarks = _flat(found.uv[:, at, :BODY])
+    weight = LANDMARK_WEIGHT * _flat(found.weight[:, at, :BODY])
+    unit, _ = given.normalised(landmarks)
+
+    # The prior pulls towards the given cameras, not towards those of the last round.
+    cameras = unit
     for _ in range(settings.refinements):
-        p = found.points.p.reshape(F, -1, 3)[at]
+        now = replace(given, R=cameras.R, t=cameras.t)
+        touching = to_unit * frontier_points(now, fitted).uv
+        both = np.concatenate([landmarks, touching], axis=1)
+        certain = np.isfinite(touching).all(-1).astype(np.float64)
+        weights = np.concatenate([weight, certain], axis=1)
+        p = robust(cameras, both, weights, max_error=np.inf).p
         cameras = refine_cameras(
-            given=start,
+            given=unit,
             start=cameras,
-            p=p.reshape(-1, 3),
-            uv=_flat(found.uv[:, at]),
-            weight=_flat(found.weight[:, at]),
+            p=p,
+            uv=both,
+            weight=weights,
             rotation_prior=settings.rotation_prior,
             position_prior=settings.position_prior,
         )
-        found = correct(cameras, uv, weight, time)
-    return cameras, found
+
+    # The frames between decide.
+    refined = replace(given, R=cameras.R, t=cameras.t)
+    after = float(np.nanmedian(frontier_points(refined, judging).error))
+    return Refined(refined if after < BETTER * error else given, (error, after))
 
 
 def correct(
@@ -302,10 +378,67 @@ def correct(
     points = robust(cameras, _flat(sided), _flat(weight))
     left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
+    sided, weight = with_parts(sided, weight)
     points = robust(cameras, _flat(sided), _flat(weight))
     return Corrected(
         sided, weight, np.dstack([flips, swapped]), left_out, points
     )
+
+
+def with_parts(uv: Float, weight: Float) -> tuple[Float, Float]:
+    """Detections whose wrists, knuckles, eyes and mouth are those of hands and face.
+
+    Detectors of hands and faces see them better than that of the body. Where two cameras see the
+    part, the body's own joint is not used in the others.
+
+    Args:
+        uv: ``[C, F, J, 2]`` pixels.
+        weight: ``[C, F, J]`` their confidence.
+    """
+    uv = uv.copy()
+    weight = weight.copy()
+    joints = list(FROM_PARTS)
+    parts = list(FROM_PARTS.values())
+    replaced = (weight[:, :, parts] > 0).sum(0) >= MIN_VIEWS
+    uv[:, :, joints] = np.where(
+        replaced[..., None], uv[:, :, parts], uv[:, :, joints]
+    )
+    weight[:, :, joints] = np.where(
+        replaced, weight[:, :, parts], weight[:, :, joints]
+    )
+    return uv, weight
+
+
+def body_joints(
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
+    p: Float,
+    time: Float,
+    noise: float,
+) -> Float:
+    """The joints ``[F, 33, 3]`` of one body in smooth motion (`gsgan.prepare.many_views`).
+
+    Args:
+        cameras: ``C`` cameras.
+        uv: ``[C, F, J, 2]`` undistorted pixels.
+        weight: ``[C, F, J]`` their confidence.
+        p: ``[F, J, 3]`` triangulated; NaN = missing.
+        time: ``[F]`` seconds.
+        noise: standard deviation of a landmark, pixels.
+    """
+    seen = weight[:, :, :BODY] > 0
+    views = Views(
+        K=torch.from_numpy(cameras.K),
+        R=torch.from_numpy(cameras.R),
+        t=torch.from_numpy(cameras.t),
+        uv=torch.from_numpy(np.where(seen[..., None], uv[:, :, :BODY], 0.0)),
+        weight=torch.from_numpy(np.where(seen, weight[:, :, :BODY], 0.0)),
+        noise=noise,
+        p=torch.from_numpy(p[:, :BODY]),
+        time=torch.from_numpy(time),
+    )
+    return solve_views(views).numpy()
 
 
 def _flat(values: Float) -> Float:

@@ -112,6 +112,23 @@ FROM_HANDS = {
 }
 
 
+# The body's joints that hands and face show better: wrists and knuckles, eyes and corners of the
+# mouth.
+_FACE_JOINTS = {
+    1: "left_lid_inner",
+    2: "left_lid_upper",
+    3: "left_lid_outer",
+    4: "right_lid_inner",
+    5: "right_lid_upper",
+    6: "right_lid_outer",
+    9: "mouth_outer_0",
+    10: "mouth_outer_6",
+}
+FROM_PARTS = FROM_HANDS | {15: LEFT.start, 16: RIGHT.start}
+for _joint, _name in _FACE_JOINTS.items():
+    FROM_PARTS[_joint] = FACE.start + FACE_NAMES.index(_name)
+
+
 def joint_names() -> tuple[str, ...]:
     """Names of all joints."""
     return (*MEDIAPIPE33.names, *hand_names(), *FACE_MESH)

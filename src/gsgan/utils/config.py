@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -138,8 +139,34 @@ def by_name(name: str, choices: Mapping[str, str], default: str) -> str:
     return choices.get(name, default)
 
 
+def capture_skeleton(root: str | None) -> str:
+    """The skeleton with all landmarks that a capture has: body, hands, face."""
+    if root is None or not (Path(root).expanduser() / "hands3d.npz").is_file():
+        return "mediapipe33"
+    has_face = (Path(root).expanduser() / "face3d.npz").is_file()
+    return "holistic" if has_face else "mediapipe33_hands"
+
+
+def capture_size(root: str | None, limit: int | None) -> int | None:
+    """Pixels of the longest side of a capture's images, at most ``limit``."""
+    cameras = Path(root or "").expanduser() / "cameras.json"
+    if root is None or limit is None or not cameras.is_file():
+        return limit
+    try:
+        sizes = [
+            entry["size"] for entry in json.loads(cameras.read_text()).values()
+        ]
+        return min(limit, max(int(max(size)) for size in sizes))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return limit  # the reader says what is wrong with the file
+
+
 # Functions that files in conf/ call, as in ${by_name:…}.
 OmegaConf.register_new_resolver("by_name", by_name, replace=True)
+OmegaConf.register_new_resolver("capture_size", capture_size, replace=True)
+OmegaConf.register_new_resolver(
+    "capture_skeleton", capture_skeleton, replace=True
+)
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 OmegaConf.register_new_resolver("gpu_precision", gpu_precision, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
