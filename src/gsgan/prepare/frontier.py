@@ -79,7 +79,7 @@ def _outline(camera: CameraEntry, mask: Bytes) -> Outline | None:
 
 
 def frontier_points(
-    cameras: CameraArray, outlines: list[list[Outline | None]]
+    cameras: CameraArray, outlines: Sequence[Sequence[Outline | None]]
 ) -> Frontier:
     """The frontier points of all pairs of cameras in all frames."""
     C = len(cameras)

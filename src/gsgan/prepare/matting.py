@@ -169,7 +169,7 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
         known = known & bool(np.median(change) < MAX_CHANGE)
 
     # Whether each pixel is the person: the mask's evidence, and how unlike the room it is.
-    behind = _shadowed(seen, empty.astype(np.float32), prior)
+    behind = _shadowed(seen, np.asarray(empty, np.float32), prior)
     unlike = ((seen - behind) ** 2).sum(-1) / (2 * ROOM_NOISE**2) - UNSURE
     unlike = np.where(known, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
     blurred = cv2.GaussianBlur(prior, (0, 0), reach / 2).clip(0.02, 0.98)

@@ -46,8 +46,9 @@ from gsgan.utils.checks import above, at_least, whole
 WRIST_SCALE = 40.0  # distance from the pose's wrist at which a hand counts half
 MAX_HAND_ERROR = 20.0  # maximum median error of a detected hand
 OWN_PAIRS = tuple((j, j + HAND) for j in range(len(HAND_PAIRS)))
-# Weight of a landmark against a frontier point: landmarks are many, and off in the same direction.
-LANDMARK_WEIGHT = 0.01
+# Weights of a landmark against a frontier point that are tried: landmarks are many, and off in the
+# same direction, but a person who hardly moves has few different frontier points.
+LANDMARK_WEIGHTS = (0.01, 1.0)
 MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
 # Refined cameras are taken if silhouettes are nearer to epipolar lines than this share of their
 # distance with the given ones, in frames that took no part.
@@ -307,36 +308,54 @@ def refine(
     if settings.refinements == 0 or before.uv.shape[1] < MIN_FRONTIER:
         return Refined(given, (error, error))
 
-    # Landmarks of the body in the same frames; pixels are those of one focal length.
-    at = np.array(some[::2])
+    # The best of the refined cameras, by the frames between.
+    best = given
+    lowest = np.inf
+    for weight in LANDMARK_WEIGHTS:
+        cameras = _refined(given, found, fitted, some[::2], weight, settings)
+        after = float(np.nanmedian(frontier_points(cameras, judging).error))
+        if after < lowest:
+            best = cameras
+            lowest = after
+    if lowest > BETTER * error:
+        best = given
+    return Refined(best, (error, lowest))
+
+
+def _refined(
+    given: CameraArray,
+    found: Corrected,
+    outlines: Sequence[Sequence[Outline | None]],
+    frames: Sequence[int],
+    landmark_weight: float,
+    settings: SolveSettings,
+) -> CameraArray:
+    """Cameras refined by the outlines and the body's landmarks of some frames."""
+    # Pixels are those of one focal length.
+    at = np.array(frames)
     to_unit = (UNIT_FOCAL / given.focal)[:, None, None]
     landmarks = _flat(found.uv[:, at, :BODY])
-    weight = LANDMARK_WEIGHT * _flat(found.weight[:, at, :BODY])
+    weight = landmark_weight * _flat(found.weight[:, at, :BODY])
     unit, _ = given.normalised(landmarks)
 
     # The prior pulls towards the given cameras, not towards those of the last round.
     cameras = unit
     for _ in range(settings.refinements):
         now = replace(given, R=cameras.R, t=cameras.t)
-        touching = to_unit * frontier_points(now, fitted).uv
+        touching = to_unit * frontier_points(now, outlines).uv
         both = np.concatenate([landmarks, touching], axis=1)
-        certain = np.isfinite(touching).all(-1).astype(np.float64)
+        certain = known(touching).astype(np.float64)
         weights = np.concatenate([weight, certain], axis=1)
-        p = robust(cameras, both, weights, max_error=np.inf).p
         cameras = refine_cameras(
             given=unit,
             start=cameras,
-            p=p,
+            p=robust(cameras, both, weights, max_error=np.inf).p,
             uv=both,
             weight=weights,
             rotation_prior=settings.rotation_prior,
             position_prior=settings.position_prior,
         )
-
-    # The frames between decide.
-    refined = replace(given, R=cameras.R, t=cameras.t)
-    after = float(np.nanmedian(frontier_points(refined, judging).error))
-    return Refined(refined if after < BETTER * error else given, (error, after))
+    return replace(given, R=cameras.R, t=cameras.t)
 
 
 def correct(
