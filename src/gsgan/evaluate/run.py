@@ -339,7 +339,7 @@ def evaluate_folder(
         predict=painter(avatar.to(device), solve=solve, colours=not other),
         method=method,
         device=device,
-        marks=[*marks, *avatar.effects.marks],
+        marks=marks,
         poses=avatar.poses,
         beside=folder if other else None,
     )

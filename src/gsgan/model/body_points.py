@@ -36,6 +36,9 @@ FOLLOWED_BONES = 6
 AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
+# Points per pixel of the person from which Step I's colour has scored as well as the generator's
+# image (docs/ablations.md#who-needs-the-generator).
+DENSE = 1.0
 MIN_POINTS = 5000
 MAX_POINTS = 100_000
 # a possible weight below it starts there, so that it can grow

@@ -19,12 +19,12 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
-from gsgan.effects.record import LEFT_OUT, OFF
+from gsgan.effects.record import OFF
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import (
     AUTO,
+    DENSE,
     BodyPoints,
-    points_for,
     points_per_pixel,
 )
 from gsgan.model.colour import ColourCorrection
@@ -111,38 +111,16 @@ def build_avatar(
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
         settings = _effect_settings(config)
-        effects = effects or decide(scene, settings, parts.in_effects(scene))
-
-        # Pose code and S are inputs of the generator.
-        if not effects.generator.on:
-            parts = replace(
-                parts, generator=None, pose_encoder=None, segmentation=None
-            )
-        elif getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
-            gaussians = parts.in_effects(scene).gaussians
-            parts = _with_last_level(parts, gaussians, effects, settings)
+        effects = effects or decide(scene, settings, parts.in_effects)
 
         # S needs the body with a label per vertex.
-        labelled: tuple[SkinnedBody | None, str] = (None, LEFT_OUT)
+        labelled: tuple[SkinnedBody | None, str] = (
+            None,
+            "the model leaves it out",
+        )
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)
-
-
-def _with_last_level(
-    parts: AvatarParts,
-    gaussians: float | None,
-    effects: Effects,
-    settings: EffectSettings,
-) -> AvatarParts:
-    """The parts with a last level of the generator, or without it where G is as dense as pixels.
-
-    ``gaussians``: on the body, for each pixel of the person; None where that is not known.
-    """
-    assert parts.generator is not None
-    dense = gaussians is not None and gaussians >= settings.gaussians_per_pixel
-    refine = not (effects.body_points.on and dense)
-    return replace(parts, generator=partial(parts.generator, refine=refine))
 
 
 @dataclass(frozen=True)
@@ -205,7 +183,8 @@ class AvatarParts:
                 "nothing paints; give a deformation, a surface or a generator"
             )
 
-    def in_effects(self, scene: SceneInfo) -> ModelParts:
+    @property
+    def in_effects(self) -> ModelParts:
         """The parts that effects act on."""
         return ModelParts(
             splats=self.densify is not None or self.surface is not None,
@@ -214,29 +193,7 @@ class AvatarParts:
                 getattr(self.deformation, "func", object), Deformation
             ),
             body_points=self.body_points is not None,
-            generator=self.generator is not None,
-            gaussians=self._gaussians_per_pixel(scene),
         )
-
-    def _gaussians_per_pixel(self, scene: SceneInfo) -> float | None:
-        """Gaussians on the body per pixel of the person; None without a body."""
-        if self.body_points is None or self.densify is None:
-            return None
-
-        # The number that the config gives, or that of the body's vertices.
-        template = template_of(scene.skeleton, scene.face)
-        height = _body_height(scene, template)
-        scale = scene.scale_train[1]
-        chosen = self.body_points.keywords
-        count = chosen.get("points")
-        if count == AUTO:
-            count = points_for(height, scale, chosen["spacing"])
-        if count is None:
-            body = open_body(scene.body, scene.body_file, scene.betas)
-            if body is None:
-                return None
-            count = len(body.vertices)
-        return points_per_pixel(count, height, scale)
 
 
 def _assembled(
@@ -292,7 +249,13 @@ def _assembled(
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
     splats = deformation or surface
-    generator = _generator(parts, template, splats, segmentation)
+    dense = False
+    if body_points is not None:
+        per_pixel = points_per_pixel(
+            len(body_points.points), body_height, scene.scale_train[1]
+        )
+        dense = per_pixel >= DENSE
+    generator = _generator(parts, template, splats, segmentation, dense=dense)
     colour = None
     if effects.colour_correction.on:
         colour = ColourCorrection(effects.cameras, scene.camera_names)
@@ -366,10 +329,20 @@ def _generator(
     template: SkeletonTemplate,
     splats: ResidualGaussians | SurfaceGaussians | None,
     segmentation: Segmentation | None,
+    *,
+    dense: bool,
 ) -> Generator | None:
-    """The UNet; if nothing is splatted, the drawn skeleton takes F's place."""
+    """The UNet; if nothing is splatted, the drawn skeleton takes F's place.
+
+    ``dense``: Gaussians on the body are as many as pixels, which a last level would not sharpen.
+    """
     if parts.generator is None or parts.pose_encoder is None:
         return None
+
+    # A generator of one's own need not have the setting.
+    options: dict[str, Any] = {}
+    if getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
+        options["refine"] = not dense
 
     # Channels of its inputs; F has three for the colour of Step I before its features.
     drawn = len(template.draw_groups)
@@ -379,6 +352,7 @@ def _generator(
         skeleton_channels=drawn if splats else 0,
         pose_channels=parts.pose_encoder.channels,
         supersample=parts.supersample if splats else 1,
+        **options,
     )
 
 

@@ -413,7 +413,7 @@ def _evaluate(
         predict=painter(avatar),
         method=method,
         device=device,
-        marks=[*module.marks, *avatar.effects.marks],
+        marks=module.marks,
         poses=avatar.poses,
     )
 
