@@ -27,7 +27,7 @@ def scene(**changes) -> SceneInfo:
     plain = SceneInfo(
         camera_names=(*CAMERAS, "held_out"), n_train_cameras=6, train_cameras=CAMERAS,
         has_distortion=False, has_labels=False, n_labels=0, label_names=(), has_body_pose=True,
-        body="free", skeleton="mediapipe33", body_height=4.0, centre=(0.0, 0.0, 1.0), frames=10,
+        body="free", skeleton="mediapipe33", limb_length_sum=4.0, centre=(0.0, 0.0, 1.0), frames=10,
         scale_train=(50.0, 60.0), surface=ALIKE, darkest=0.1,
     )  # fmt: skip
     return replace(plain, **changes)

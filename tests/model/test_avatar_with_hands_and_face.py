@@ -89,7 +89,7 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(
             frames,
             frame.camera,
             avatar.template,
-            avatar.body_height,
+            avatar.stature,
         )
         inputs.append(pose_inputs(*given))
         (

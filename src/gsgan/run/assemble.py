@@ -209,8 +209,8 @@ def _assembled(
     of the others. ``labelled``: S's body, and where its labels come from or why there is none.
     """
     template = template_of(scene.skeleton, scene.face)
-    body_height = _body_height(scene, template)
-    sizes = {"body_height": body_height, "sh_degree": effects.degree}
+    stature = template.stature_of(scene.limb_length_sum)
+    sizes = {"stature": stature, "sh_degree": effects.degree}
     formation: dict[str, Any] = {
         "low_pass": parts.low_pass,
         "antialias": effects.antialias.on,
@@ -218,7 +218,7 @@ def _assembled(
 
     # The points, and Ψ, which moves them; or Gaussians that move with the body alone.
     torch.manual_seed(seed + 1)
-    body_points = _body_points(parts, scene, effects, body_height)
+    body_points = _body_points(parts, scene, effects, stature)
     points = body_points or parts.densify
     deformation = surface = None
     if parts.deformation and points:
@@ -252,7 +252,7 @@ def _assembled(
     dense = False
     if body_points is not None:
         per_pixel = points_per_pixel(
-            len(body_points.points), body_height, scene.scale_train[1]
+            len(body_points.points), stature, scene.scale_train[1]
         )
         dense = per_pixel >= DENSE
     generator = _generator(parts, template, splats, segmentation, dense=dense)
@@ -265,8 +265,8 @@ def _assembled(
         accuracy=replace(
             parts.accuracy, supersample=parts.supersample, **formation
         ),
-        limb_length_sum=float(scene.body_height),
-        body_height=body_height,
+        limb_length_sum=scene.limb_length_sum,
+        stature=stature,
         deformation=deformation,
         densify=None if body_points else parts.densify,
         body_points=body_points,
@@ -283,14 +283,14 @@ def _assembled(
 
 
 def _body_points(
-    parts: AvatarParts, scene: SceneInfo, effects: Effects, body_height: float
+    parts: AvatarParts, scene: SceneInfo, effects: Effects, stature: float
 ) -> BodyPoints | None:
     """Points on the skinned body; None where Gaussians start from the skeleton's shapes."""
     if not (parts.densify and parts.body_points and effects.body_points.on):
         return None
     return parts.body_points(
         body=_required_body(scene, "effects.body_points=on"),
-        body_height=body_height,
+        stature=stature,
         scale=scene.scale_train[1],
     )
 
@@ -316,12 +316,6 @@ def _set_by_scene(
         assert scene.proportions is not None
         found["light"] = scene.proportions.up
     return found
-
-
-def _body_height(scene: SceneInfo, template: SkeletonTemplate) -> float:
-    """The person's stature in metres; it follows from limb lengths, which no pose changes."""
-    limbs = float(scene.body_height)
-    return limbs * template.stature / template.limb_length_sum
 
 
 def _generator(

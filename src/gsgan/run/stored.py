@@ -284,6 +284,10 @@ def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
         if values.get(key) is not None:
             values[key] = kind(**values[key])
 
+    # Called by another name until 2026-11-29.
+    if "body_height" in values:
+        values["limb_length_sum"] = values.pop("body_height")
+
     # Stored until 2026-11-26; nothing depends on it now.
     values.pop("scale_test", None)
     return SceneInfo(**values)

@@ -129,7 +129,7 @@ def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
 def _advice(module: AvatarTraining, count: int, scale: float) -> list[Row]:
     """Whether the model could do without its generator, as ``count`` Gaussians on the body are as
     many as pixels in images of ``scale`` pixels per metre."""
-    per_pixel = points_per_pixel(count, module.avatar.body_height, scale)
+    per_pixel = points_per_pixel(count, module.avatar.stature, scale)
     if module.avatar.generator is None or per_pixel < DENSE:
         return []
     return [
