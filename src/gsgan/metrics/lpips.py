@@ -87,8 +87,9 @@ class LpipsAgainst:
         self.square_truth = {}
         for net, network in networks.items():
             network.to(target.device)
-            self.backgrounds[net] = network.background(background)
-            self.truth[net] = self.backgrounds[net].differing(whole)
+            normalised = network.network.normalised
+            self.backgrounds[net] = network.background(normalised(background))
+            self.truth[net] = self.backgrounds[net].differing(normalised(whole))
             if square is not None:
                 self.square_truth[net] = network.features(square)
 
@@ -135,7 +136,7 @@ class LpipsAgainst:
         background, and computed elsewhere."""
         background = self.backgrounds[net]
         truth = self.truth[net]
-        own = background.differing(image)
+        own = background.differing(self.networks[net].network.normalised(image))
         shown = list(filter(None, (own, truth)))
         if not shown:
             return [torch.zeros_like(x[:, :1]) for x in background.maps]

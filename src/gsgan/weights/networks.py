@@ -15,7 +15,7 @@ from gsgan.weights.files import (
     read_convolutions,
     state_of_heads,
 )
-from gsgan.weights.parts import Background
+from gsgan.weights.parts import BackgroundMaps
 
 # The mean and deviation of ImageNet's channels, with which both networks were trained.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -142,21 +142,22 @@ class Lpips(nn.Module):
             self.register_buffer(
                 f"head{layer}", state[f"lin{layer}.model.1.weight"]
             )
-        self._background: Background | None = None
+        self._background: BackgroundMaps | None = None
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Unit-length features of images ``[B, 3, H, W]`` in [0, 1]."""
         return list(map(unit, self.network(image)))
 
-    def background(self, image: Tensor) -> Background:
-        """The maps of an image ``[1, 3, H, W]`` of the background alone, kept for the next call."""
+    def background(self, image: Tensor) -> BackgroundMaps:
+        """The maps of a normalised image ``[1, 3, H, W]`` of the background alone, kept for later
+        calls."""
         kept = self._background
         if (
             kept is None
             or kept.image.device != image.device
             or not torch.equal(kept.image, image)
         ):
-            kept = self._background = Background(self.network, image)
+            kept = self._background = BackgroundMaps(self.network.stages, image)
         return kept
 
     def layers(

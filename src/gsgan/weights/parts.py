@@ -8,21 +8,18 @@ computed there, and reads what lies around from the background's maps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-
-if TYPE_CHECKING:
-    from gsgan.weights.networks import FeatureNetwork
 
 Span = tuple[
     int, int
 ]  # the first row or column, and the first one after the last
 
 
-class Part(NamedTuple):
+class MapPart(NamedTuple):
     """A part of a map.
 
     Args:
@@ -35,31 +32,31 @@ class Part(NamedTuple):
     columns: Span
 
 
-class Background:
+class BackgroundMaps:
     """The maps of an image of the background alone.
 
     Args:
-        network: whose layers are convolutions, ReLUs and poolings without padding.
-        image: ``[1, 3, H, W]``.
+        stages: of a network, with convolutions, ReLUs and poolings without padding.
+        image: ``[1, 3, H, W]`` as the first layer gets it, like all images here.
     """
 
     @torch.no_grad()
-    def __init__(self, network: FeatureNetwork, image: Tensor) -> None:
-        self.network = network
+    def __init__(self, stages: nn.ModuleList, image: Tensor) -> None:
+        self.stages = stages
         self.image = image
 
         # The input of each layer, and the maps after each stage.
         self.inputs: dict[nn.Module, Tensor] = {}
         self.maps = []
-        values = network.normalised(image)
-        for stage in network.stages:
+        values = image
+        for stage in stages:
             for layer in stage.children():
                 self.inputs[layer] = values
                 values = layer(values)
             self.maps.append(values)
 
     @torch.no_grad()
-    def differing(self, image: Tensor) -> list[Part]:
+    def differing(self, image: Tensor) -> list[MapPart]:
         """The part of each map of an image in which it may differ from the background's; an empty
         list for an image that equals the background."""
         # The smallest rectangle around all pixels that differ.
@@ -68,19 +65,18 @@ class Background:
             return []
         rows = _span(differs.any(dim=1))
         columns = _span(differs.any(dim=0))
-        values = _cut(image, rows, columns)
-        part = Part(self.network.normalised(values), rows, columns)
+        part = MapPart(_cut(image, rows, columns), rows, columns)
 
         # Each layer continues from the part of the one before.
         parts = []
-        for stage in self.network.stages:
+        for stage in self.stages:
             for layer in stage.children():
                 part = self._after(layer, part)
             parts.append(part)
         return parts
 
     def on(
-        self, stage: int, parts: list[Part], rows: Span, columns: Span
+        self, stage: int, parts: list[MapPart], rows: Span, columns: Span
     ) -> Tensor:
         """A stage's map of an image with these parts, in rows and columns that contain its part."""
         # Only a part that is smaller needs the background around it.
@@ -94,7 +90,7 @@ class Background:
             return values
         return _pasted(values, parts[stage], rows[0], columns[0])
 
-    def _after(self, layer: nn.Module, part: Part) -> Part:
+    def _after(self, layer: nn.Module, part: MapPart) -> MapPart:
         """The part of a layer's output, from that of its input."""
         if isinstance(layer, nn.ReLU):
             return part._replace(values=layer(part.values))
@@ -113,7 +109,7 @@ class Background:
             )
         else:
             values = layer(values)
-        return Part(values, rows, columns)
+        return MapPart(values, rows, columns)
 
 
 def union(spans: Sequence[Span]) -> Span:
@@ -167,7 +163,7 @@ def _cut(values: Tensor, rows: Span, columns: Span) -> Tensor:
     return functional.pad(inside, beyond) if any(beyond) else inside
 
 
-def _pasted(values: Tensor, part: Part, top: int, left: int) -> Tensor:
+def _pasted(values: Tensor, part: MapPart, top: int, left: int) -> Tensor:
     """Values that begin at row ``top`` and column ``left`` of a map, with a part of it in place."""
     first_row = part.rows[0] - top
     first_column = part.columns[0] - left
