@@ -92,10 +92,10 @@ class Blobs(nn.Module):
     features = 0  # channels of F besides the three of colour
 
     def __init__(
-        self, body, body_height: float, sh_degree: int, count: int = 50
+        self, body, stature: float, sh_degree: int, count: int = 50
     ) -> None:
         super().__init__()
-        self.points, self.size = SkinnedPoints(body, count), 0.03 * body_height
+        self.points, self.size = SkinnedPoints(body, count), 0.03 * stature
         self.sh_degree = self.active_degree = sh_degree
         self.colour = nn.Parameter(torch.full((count, 3), 0.5))
 

@@ -79,3 +79,12 @@ def test_the_examples_of_the_page_run(run, tmp_path, monkeypatch):
     assert namespace["means"].grad.abs().sum() > 0
     deformed, points = namespace["deformed"], namespace["points"]
     assert (deformed.means - points.means).abs().max() < 1e-5
+
+    # Lengths of the page's Ψ and of the avatar's own are the same quantity.
+    avatar, psi = namespace["avatar"], namespace["psi"]
+    own = avatar.template.stature_of(avatar.limb_length_sum)
+    assert avatar.deformation.stature == avatar.stature == own
+    body, pose = namespace["body"], namespace["pose"]
+    height = body.posed_vertices(pose)[0, :, 2]
+    true = float(height.max() - height.min())
+    assert psi.stature == pytest.approx(true, rel=0.05)

@@ -265,7 +265,7 @@ def test_scene_info(ten_frames):
     expected = skeletons(10)[:8].mean(1)
     assert np.allclose(info.centre, np.median(expected, axis=0), atol=0.02)
     # arms and legs of the stick figure: (0.278 + 0.224 + 0.45 + 0.4) metres a side, hands and feet
-    assert 3.0 < info.body_height < 4.5
+    assert 3.0 < info.limb_length_sum < 4.5
     json.dumps(asdict(info))  # plain values, so that a checkpoint can hold it
 
 
@@ -403,7 +403,7 @@ def test_the_real_capture_is_read_whole(real_capture):
     assert set(data.reasons) == {"novel_view"}
     assert len(data.dataset("novel_pose")) == 4 * 14
     assert data.info.n_train_cameras == 4
-    assert 3.4 < data.info.body_height < 4.8  # 2.4 times the stature, about
+    assert 3.4 < data.info.limb_length_sum < 4.8  # 2.4 times the stature, about
     # white balance differs between the cameras
     assert data.info.surface.difference > 0.03
 

@@ -51,7 +51,7 @@ def test_skeletons_have_33_or_75_or_105_joints_in_metres(
         info = GsganData(str(root), **settings).info
         assert info.skeleton == skeleton
         assert (info.face is None) == (skeleton != "holistic")
-        heights.add(info.body_height)
+        heights.add(info.limb_length_sum)
     assert len(heights) == 1
 
 

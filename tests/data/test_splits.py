@@ -2,12 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from make import write_tiny_capture
 from omegaconf import OmegaConf
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.splits import make_splits, parse_frames, parse_names
+from gsgan.data.splits import (
+    Items,
+    make_splits,
+    parse_frames,
+    parse_names,
+    spread_items,
+)
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -166,6 +173,50 @@ def test_frames_that_are_not_there_are_noted(layout):
 def test_splits_that_cannot_be(layout, keys, error, message):
     with pytest.raises(error, match=message):
         make_splits(layout, **keys)
+
+
+def test_images_are_spread_over_frames_first_and_then_over_cameras():
+    names = [f"cam{i}" for i in range(6)]
+    items = Items({name: np.arange(21) for name in names})
+    places = spread_items(items, 42)
+    chosen = [items[place] for place in places]
+    assert places == sorted(set(places))
+    for frame in range(21):
+        cameras = [camera for camera, number in chosen if number == frame]
+        assert len(set(cameras)) == 2
+    for name in names:
+        assert 6 <= sum(camera == name for camera, _ in chosen) <= 8
+    frames = [items[place][1] for place in spread_items(items, 7)]
+    assert sorted(frames) == [1, 4, 7, 10, 13, 16, 19]
+    assert spread_items(items, 1000) == list(range(126))
+    assert spread_items(Items({}), 3) == []
+
+
+def test_frames_that_a_camera_lacks_are_taken_from_the_others():
+    items = Items({"a": np.array([0, 1, 2]), "b": np.array([2])})
+    assert spread_items(items, 3) == [0, 1, 2]
+    assert spread_items(items, 4) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("given", "frames"),
+    [("auto", (7,)), ("2-3", (2, 3)), ([0, "6-7"], (0, 6, 7))],
+)
+def test_validation_frames_are_cut_from_the_training_frames(
+    layout, given, frames
+):
+    plain = make_splits(layout)
+    splits = make_splits(layout, validation_frames=given)
+    assert tuple(splits.items["validation"].frames) == frames
+    assert not set(frames) & set(splits.train_frames)
+    assert {*frames, *splits.train_frames} == set(plain.train_frames)
+    assert list(splits.items["novel_pose"]) == list(plain.items["novel_pose"])
+    assert "validation" not in plain.items
+
+
+def test_validation_frames_are_training_frames(layout):
+    with pytest.raises(ConfigError, match=r"validation_frames.* 8 is none"):
+        make_splits(layout, validation_frames="7-8")
 
 
 def test_frames_and_names_are_parsed():

@@ -223,7 +223,6 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
         f"data.smpl={smpl_file}",
         "data.size=32",
         "data.reader.drop_frames=3",
-        "effects.generator=on",
     )
     data = build_data(config)
     assert data.layout.frames == (0, 1, 2)

@@ -53,33 +53,16 @@ def test_off_builds_no_parameter_and_calls_no_operator(
         assert not off.accuracy.antialias
 
 
-def test_dense_gaussians_on_a_body_need_no_generator(build):
-    """Its inputs S and the pose code go with it."""
-    body = "effects.body_points=on"
-    _, dense, frame = build(body, "effects.gaussians_per_pixel=0")
-    assert dense.generator is None
-    assert dense.segmentation is None
-    assert dense.pose_encoder is None
-    assert "Step I's colour" in dense.effects.generator.why
-    _, forced, _ = build(
-        body, "effects.gaussians_per_pixel=0", "effects.generator=on"
-    )
-    assert forced.generator is not None
-    _, same, _ = build(body, "model=splat_only")
-    assert calls(dense, frame) == calls(same, frame)
-
-
 @pytest.mark.parametrize(
-    ("body_points", "limit", "refines"),
-    [("off", 0, True), ("on", 1e6, True), ("on", 0, False)],
+    ("body_points", "count", "refines"),
+    [("off", 500, True), ("on", 20, True), ("on", 500, False)],
 )
 def test_dense_gaussians_on_a_body_need_no_last_level(
-    build, body_points, limit, refines
+    build, body_points, count, refines
 ):
     _, avatar, _ = build(
         f"effects.body_points={body_points}",
-        f"effects.gaussians_per_pixel={limit}",
-        "effects.generator=on",
+        f"size.body_points={count}",
         "size.generator_patch=2",
         "size.generator_refine=auto",
     )
@@ -190,8 +173,7 @@ def test_all_means_all_that_this_model_can_have(build):
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar(*frame.inputs).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")
-    left = {name for name, effect in avatar.effects if effect.on}
-    assert left == {"generator"}
+    assert not any(effect.on for _, effect in avatar.effects)
     assert torch.isfinite(avatar(*frame.inputs).image).all()
 
 

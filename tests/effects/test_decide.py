@@ -27,15 +27,14 @@ def scene(**changes) -> SceneInfo:
     plain = SceneInfo(
         camera_names=(*CAMERAS, "held_out"), n_train_cameras=6, train_cameras=CAMERAS,
         has_distortion=False, has_labels=False, n_labels=0, label_names=(), has_body_pose=True,
-        body="free", skeleton="mediapipe33", body_height=4.0, centre=(0.0, 0.0, 1.0), frames=10,
+        body="free", skeleton="mediapipe33", limb_length_sum=4.0, centre=(0.0, 0.0, 1.0), frames=10,
         scale_train=(50.0, 60.0), surface=ALIKE, darkest=0.1,
     )  # fmt: skip
     return replace(plain, **changes)
 
 
 def on(effects: Effects) -> set[str]:
-    """What is on beside the generator, which is a part of the method."""
-    return {name for name, effect in effects if effect.on} - {"generator"}
+    return {name for name, effect in effects if effect.on}
 
 
 def test_a_plain_scene_calls_for_what_it_always_had():
@@ -243,10 +242,8 @@ def test_configs_say_what_their_names_say(compose):
     # the camera's own
     assert on(decide(scene(has_distortion=True), none)) == {"distortion"}
     found = on(decide(scene(has_distortion=True), every))
-    assert found == set(CHOICES) - {"generator"}
+    assert found == set(CHOICES)
     assert on(decide(scene(), every)) == found - {"distortion"}
-    for settings in (none, every):
-        assert decide(scene(), settings).generator.on
     listed = instantiate(compose("train", "effects.only=[antialias]").effects)
     assert on(decide(scene(), listed)) == {"antialias"}
 
@@ -301,13 +298,15 @@ def test_registration_without_a_body_is_refused_or_left_out():
     assert not decide(scene(**PRINTED), settings).registration.on
 
 
-def test_checkpoints_from_before_an_effect_existed_are_read():
+def test_checkpoints_from_before_and_after_an_effect_existed_are_read():
     stored = decide(scene(), EffectSettings()).plain()
     del stored["registration"]
-    del stored["generator"]
-    found = Effects.from_plain(stored)
-    assert not found.registration.on
-    assert found.generator.on
+    stored["generator"] = {
+        "value": "on",
+        "why": "no effect now",
+        "forced": False,
+    }
+    assert not Effects.from_plain(stored).registration.on
 
 
 @pytest.mark.parametrize(
@@ -326,57 +325,6 @@ def test_light_is_found_where_the_person_is_seen_from_all_sides(
     found = decide(scene(**changes), EffectSettings(), ModelParts(**parts))
     assert found.light.value == value
     assert why in found.light.why
-
-
-ON_BODY = {"body_inside": 1.0}
-
-
-@pytest.mark.parametrize(
-    ("changes", "parts", "value", "why"),
-    [
-        (ON_BODY, {"gaussians": 3.2}, "off", "3.2 Gaussians per pixel"),
-        (ON_BODY, {"gaussians": 0.8}, "on", "0.8 Gaussians per pixel"),
-        (ON_BODY, {"gaussians": None}, "on", "not known"),
-        (ON_BODY, {"splats": False, "points": False}, "on", "nothing else"),
-        ({}, {"gaussians": 3.2}, "on", "start from the skeleton"),
-        ({}, {"generator": False}, "off", "the model leaves it out"),
-    ],
-)
-def test_a_generator_is_for_gaussians_that_are_fewer_than_pixels(
-    changes, parts, value, why
-):
-    settings = EffectSettings()
-    found = decide(scene(**changes), settings, ModelParts(**parts)).generator
-    assert found.value == value
-    assert why in found.why
-
-
-def test_a_generator_is_kept_or_left_out_on_request():
-    dense = ModelParts(gaussians=3.2)
-    settings = EffectSettings(generator="on")
-    assert decide(scene(**ON_BODY), settings, dense).generator.on
-    # A model without one is a choice as well.
-    without = ModelParts(generator=False)
-    assert not decide(scene(), settings, without).generator.on
-    settings = EffectSettings(generator="off")
-    assert not decide(scene(), settings).generator.on
-
-
-def test_scores_say_that_a_generator_was_left_out_which_the_model_has():
-    dense = ModelParts(gaussians=3.2)
-    found = decide(scene(**ON_BODY), EffectSettings(), dense)
-    (mark,) = found.marks
-    assert mark.startswith("without the model's generator: ")
-    assert "3.2 Gaussians per pixel" in mark
-    (mark,) = decide(scene(), EffectSettings(generator="off")).marks
-    assert mark.endswith("set in the config")
-    assert not decide(scene(), EffectSettings(generator="on")).marks
-    # splat_only has none, which its name says.
-    for requested in ("auto", "on", "off"):
-        settings = EffectSettings(generator=requested)
-        without = ModelParts(generator=False)
-        assert not decide(scene(), settings, without).marks
-    assert not Effects().marks
 
 
 def test_a_run_is_not_resumed_with_other_effects():

@@ -18,6 +18,7 @@ from gsgan.evaluate.scores import (
     image_scores,
     means,
     miou,
+    over_poses,
     painter,
     score_split,
 )
@@ -64,6 +65,19 @@ def test_means_by_camera_and_over_all():
     assert [cameras[c]["psnr"] for c in "ab"] == pytest.approx(
         [30.0, 60.0], abs=1e-3
     )
+
+
+def test_poses_differ_by_the_deviation_of_their_own_means():
+    rows = [
+        {"frame": 0, "psnr": 20.0, "ssim": 0.5},
+        {"frame": 0, "psnr": 22.0},
+        {"frame": 1, "psnr": 25.0},
+        {"frame": 1, "psnr": math.inf},
+        {"frame": 2, "psnr": math.nan, "miou": None},
+    ]
+    # means of 21 and 25 dB; one pose alone has no deviation
+    assert over_poses(rows) == {"psnr_over_poses": pytest.approx(8**0.5)}
+    assert over_poses([{"frame": 0, "psnr": 1.0}]) == {}
 
 
 def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():

@@ -95,6 +95,51 @@ def test_equal_images_have_no_distance_and_a_black_one_is_finite(networks):
     )
 
 
+@pytest.mark.parametrize("background", ["black", "white"])
+@pytest.mark.parametrize(
+    ("shown", "painted"),
+    [
+        ((40, 90, 50, 80), (44, 93, 40, 80)),  # rows and columns
+        ((0, 20, 0, 30), (0, 20, 0, 30)),
+        ((100, 131, 120, 149), (60, 131, 100, 149)),
+        ((0, 131, 0, 149), (0, 131, 0, 149)),
+        ((40, 90, 50, 80), None),
+        (None, None),
+    ],
+)
+def test_what_both_images_show_of_the_background_is_not_computed(
+    networks, background, shown, painted
+):
+    """The scores are those of whole images, of odd sizes too."""
+    generator = torch.Generator().manual_seed(0)
+    grey = 0.0 if background == "black" else 1.0
+    images = []
+    for box in (painted, shown):
+        image = torch.full((1, 3, 131, 149), grey)
+        if box is not None:
+            top, bottom, left, right = box
+            part = image[..., top:bottom, left:right]
+            part += torch.rand(part.shape, generator=generator) - grey
+        images.append(image)
+    image, target = images
+    measures = MetricVariants(background=background)
+    mask = torch.zeros(1, 1, 131, 149)
+    mask[..., 30:100, 40:90] = 1
+    scores = LpipsAgainst(target, mask, networks, measures)(image)
+    for name, network in networks.items():
+        with torch.no_grad():
+            features = network.features(image), network.features(target)
+            layers = network.layers(*features)
+        whole = sum(float(layer.mean()) for layer in layers)
+        assert scores[f"lpips_{name}"] == pytest.approx(whole, abs=1e-6)
+        enlarged = sum(
+            torch.nn.functional.interpolate(x, (131, 149), mode="bilinear")
+            for x in layers
+        )
+        inside = float(enlarged[..., 30:100, 40:90].mean())
+        assert scores[f"lpips_{name}_person"] == pytest.approx(inside, abs=1e-6)
+
+
 def test_the_gradient_of_a_black_image_is_finite(networks):
     image = torch.zeros(1, 3, 64, 64, requires_grad=True)
     networks["alex"](image, torch.ones(1, 3, 64, 64)).sum().backward()

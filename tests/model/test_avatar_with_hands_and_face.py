@@ -89,7 +89,7 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(
             frames,
             frame.camera,
             avatar.template,
-            avatar.body_height,
+            avatar.stature,
         )
         inputs.append(pose_inputs(*given))
         (
@@ -191,7 +191,7 @@ def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(
 
 def test_a_missing_hand_rests_on_its_arm(handed):
     """Through rendering: no hand at the origin or elsewhere, in G or in S."""
-    words = ("effects.body_points=on", "effects.generator=on")
+    words = ("effects.body_points=on",)
     _, avatar, frame = handed(*words, "model.segmentation.mode=hands")
     p = frame.skeleton[0].clone()
     p[33:54] = torch.nan

@@ -118,9 +118,7 @@ def test_the_step_scales_offsets_up_to_the_same_bound(densify):
     for value, expected in ((1.0, 0.1), (1e4, 20.0)):
         slow.head.bias.data[:3] = value
         moved = (run(slow, densify, p).means - at_rest).norm(dim=-1)
-        reach = (
-            3**0.5 * slow.mean_bound * slow.body_height * math.tanh(expected)
-        )
+        reach = 3**0.5 * slow.mean_bound * slow.stature * math.tanh(expected)
         torch.testing.assert_close(
             moved, torch.full_like(moved, reach), rtol=1e-4, atol=0
         )

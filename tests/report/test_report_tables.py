@@ -46,6 +46,21 @@ def test_mean_spread_seeds_and_floor(tmp_path):
     assert floor.cells[0].spread is None  # one value for all seeds
 
 
+def test_the_deviation_over_poses_stands_in_brackets(tmp_path):
+    folders = seeds(tmp_path)
+    for deviation, folder in enumerate(folders, start=1):
+        path = folder / "metrics.json"
+        scores = json.loads(path.read_text())
+        for variants in scores.values():
+            variants["full"]["psnr_over_poses"] = float(deviation)
+        path.write_text(json.dumps(scores))
+    report = report_of(table(), *folders)
+    cell = row(report.grids[0], "full").cells[0]
+    assert cell.text == "31.00 ± 1.00 (2.00)"
+    assert (cell.mean, cell.spread) == (31.0, 1.0)
+    assert "over poses" in report.grids[0].remarks[0]
+
+
 def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
     runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips_vgg=0.1)]
     runs.append(write_run(tmp_path / "x", "full", 2, psnr=32.0))

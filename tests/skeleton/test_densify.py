@@ -180,7 +180,7 @@ def test_local_coordinates_scale_with_the_limb_only():
     assert (d(bent).means - d(p).means).abs().max() > 0.1
 
 
-def test_rest_points_are_the_rest_pose_in_body_heights():
+def test_rest_points_are_the_rest_pose_in_statures():
     d = densify()
     root = REST[[23, 24]].mean(0)
     torch.testing.assert_close(d.rest_points * 1.7 + root, d(rest()).means[0])

@@ -43,7 +43,7 @@ def test_missing_limbs_have_the_subjects_size():
     gone = [j for j in range(33) if j not in trunk]
     p = rest() * 1.25
     q, valid = sanitise(
-        lose(p, gone), body_height=1.25 * MEDIAPIPE33.limb_length_sum
+        lose(p, gone), limb_length_sum=1.25 * MEDIAPIPE33.limb_length_sum
     )
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
     assert valid[0].nonzero().flatten().tolist() == sorted(trunk)

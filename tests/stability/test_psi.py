@@ -28,7 +28,7 @@ def test_a_vanishing_limb_starts_at_the_least_scale():
     with torch.no_grad():
         made = psi(p, points, torch.tensor([[0.0, 1, 4]]))
     sigma = made.covariances.diagonal(dim1=-2, dim2=-1).sqrt()[..., 0]
-    minimum = psi.scale_range[0] * psi.body_height
+    minimum = psi.scale_range[0] * psi.stature
     torch.testing.assert_close(
         sigma, points.scales.clamp_min(minimum), rtol=1e-5, atol=0
     )
@@ -45,9 +45,9 @@ def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(
     reach = (
         (made["means"] - some_points(*FLOAT32)(inputs["p"]).means).abs().amax()
     )
-    assert reach <= psi.mean_bound * psi.body_height * 3**0.5 * 1.0001
+    assert reach <= psi.mean_bound * psi.stature * 3**0.5 * 1.0001
     assert ((made["opacities"] > 0) & (made["opacities"] < 1)).all()
-    low, high = (bound * psi.body_height for bound in psi.scale_range)
+    low, high = (bound * psi.stature for bound in psi.scale_range)
     sigma2 = torch.linalg.eigvalsh(made["covariances"].double() / 1e4)
     # float32 holds the least to a part of the largest
     rounding = 1e-6 * sigma2[..., -1:]

@@ -150,7 +150,7 @@ def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
 def test_a_few_steps_from_points_on_a_folded_body_stay_finite(make, turn):
     """Every joint turned so far that skinning flattens what lies between two bones."""
     words = ("effects.body_points=on", "effects.view_dependence=1")
-    words += ("training.rollback.collapse=0", "effects.generator=on")
+    words += ("training.rollback.collapse=0",)
     module, frame, fit = make((1, 2, 2), *words)
     theta = torch.zeros_like(frame.body.theta)
     theta[:, 1:, 0] = turn

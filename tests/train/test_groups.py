@@ -1,6 +1,7 @@
 """The groups callbacks, debug and logger, run on the tiny capture."""
 
 import io
+import json
 import re
 import shutil
 from pathlib import Path
@@ -14,6 +15,8 @@ from commands import refused, train
 from lightning.pytorch.loggers import wandb as wandb_logger
 from PIL import Image
 
+from gsgan.evaluate.run import choice_marks
+from gsgan.run.assemble import build_data
 from gsgan.run.stored import CHECKPOINT, read_checkpoint
 from gsgan.utils.sweeps import STOPPED
 
@@ -72,11 +75,32 @@ def test_a_run_that_a_callback_stops_resumes_from_a_remote_copy(trained):
     (folder / CHECKPOINT).write_bytes(copy)
     assert read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"] == step
 
-    # callbacks may differ between the parts of a run
+    # callbacks may differ between the parts of a run, but not its frames
     result, _ = trained(*long)
+    refused(result, "data.validation_frames")
+    result, _ = trained(*long, "data.validation_frames=auto")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "resuming from" in result.stdout
-    assert (folder / "metrics.json").is_file()
+    scores = json.loads((folder / "metrics.json").read_text())
+    assert list(scores) == ["novel_view", "novel_pose", "validation"]
+    assert not any(
+        "held-out" in x for x in scores["novel_pose"]["full"]["marks"]
+    )
+
+
+def test_scores_tell_that_held_out_images_chose_something(tiny):
+    cut = tiny("callbacks=[early_stop]")
+    data = build_data(cut)
+    assert data.watched[0] == "validation"
+    assert choice_marks(cut, data) == []
+    uncut = tiny("callbacks=[early_stop]", "data.validation_frames=null")
+    data = build_data(uncut)
+    (mark,) = choice_marks(uncut, data)
+    assert mark == "callbacks.early_stop watched held-out images"
+    searched = tiny("objective=novel_pose.full.psnr")
+    (mark,) = choice_marks(searched, data)
+    assert "novel_pose.full.psnr" in mark
+    assert not choice_marks(tiny("objective=validation.full.psnr"), data)
 
 
 def test_a_remote_copy_without_an_address_is_refused(trained):

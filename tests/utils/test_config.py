@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.scene import Camera
@@ -98,9 +99,7 @@ def differences(a, b, at: str = "") -> set[str]:
 def test_an_ablation_changes_what_it_says_and_nothing_else(
     compose, model, changed, experiment
 ):
-    chosen = ["effects.generator=on"]
-    if experiment is not None:
-        chosen.append(f"experiment={experiment}")
+    chosen = [] if experiment is None else [f"experiment={experiment}"]
     full = OmegaConf.to_container(compose("train", *chosen))
     other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
     found = {".".join(key.split(".")[:3]) for key in differences(full, other)}
@@ -109,19 +108,24 @@ def test_an_ablation_changes_what_it_says_and_nothing_else(
     } == changed
 
 
-@pytest.mark.parametrize("model", ["wo_seg", "wo_feat", "wo_gcn"])
-def test_ablations_of_the_generator_keep_it(compose, model):
-    assert compose("train").effects.generator == "auto"
-    assert compose("train", f"model={model}").effects.generator == "on"
+def test_demo_is_what_train_does_by_default_but_for_the_images_scored(compose):
+    demo = compose("train", "experiment=demo", "score_images=null")
+    del demo.equal_time
+    assert demo == compose("train")
 
 
-def test_demo_is_what_train_does_by_default_without_a_generator(compose):
-    plain = compose("train", "model=splat_only", "score_images=42")
-    assert compose("train", "experiment=demo") == plain
-    whole = compose(
-        "train", "experiment=demo", "model=full", "score_images=null"
-    )
-    assert whole == compose("train")
+@pytest.mark.parametrize("word", ["", "+", "~"])
+def test_a_key_that_is_gone_names_what_takes_its_place(inside, word):
+    result = inside("train", f"{word}effects.generator=on")
+    refused(result, "no effects.generator any more", "model=splat_only")
+
+
+def test_a_key_that_is_gone_is_refused_in_files_too(inside, tmp_path):
+    path = tmp_path / "experiment" / "mine.yaml"
+    path.parent.mkdir()
+    path.write_text("# @package _global_\neffects: {generator: auto}\n")
+    given = (f"hydra.searchpath=[file://{tmp_path}]", "experiment=mine")
+    refused(inside("train", *given), "no effects.generator any more")
 
 
 def test_every_top_level_key_is_read_by_code(compose):

@@ -32,7 +32,13 @@ from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons, face_at_rest
-from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
+from gsgan.data.splits import (
+    SPLITS,
+    VALIDATION,
+    Splits,
+    make_splits,
+    protocol_splits,
+)
 from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame, cat
 from gsgan.skeleton import TEMPLATES, template_of
@@ -95,8 +101,8 @@ class GsganData(LightningDataModule):
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
         wanted: description of the root, for the message when it is not set.
-        split_keys: train_cameras, test_cameras, train_frames, test_frames, test_share and
-            train_poses, see `make_splits`.
+        split_keys: train_cameras, test_cameras, train_frames, test_frames, test_share, train_poses
+            and validation_frames, see `make_splits`.
 
     Raises:
         ConfigError: when neither root nor source is given, or a number is out of range.
@@ -334,10 +340,10 @@ class GsganData(LightningDataModule):
 
         # Only training leaves out labels near outlines.
         datasets = {}
-        for name in SPLITS:
+        for name, items in self.splits.items.items():
             datasets[name] = CaptureDataset(
                 layout,
-                self.splits.items[name],
+                items,
                 size=self.size,
                 crop=self.crop,
                 cache=cache,
@@ -404,18 +410,20 @@ class GsganData(LightningDataModule):
 
     @property
     def eval_names(self) -> tuple[str, ...]:
-        """The held-out splits that are not empty."""
-        return tuple(name for name in SPLITS[1:] if self.splits.items[name])
+        """The splits beside the training split that are not empty."""
+        items = self.splits.items
+        return tuple(name for name in items if name != "train" and items[name])
 
     def dataset(self, split: str) -> CaptureDataset:
-        """The dataset of a split: "train", "novel_view" or "novel_pose".
+        """The dataset of a split: "train", "novel_view", "novel_pose" or, where there is one,
+        "validation".
 
         Raises:
             ValueError: for another name.
         """
-        if split not in SPLITS:
+        if split not in self.splits.items:
             raise ValueError(
-                f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}"
+                f"dataset: split must be one of {', '.join(self.splits.items)}, got {split!r}"
             )
         self.setup()
         return self._datasets[split]
@@ -461,12 +469,12 @@ class GsganData(LightningDataModule):
     def watched(self) -> tuple[str, list[int]]:
         """The split and indices of the images rendered while training, evenly spaced.
 
-        The split is the first of novel_pose, novel_view and train that is not empty.
+        The split is the first of validation, novel_pose, novel_view and train that is not empty.
         """
         # Poses are harder than views, so they are watched first.
         name = "train"
-        for split in ("novel_view", "novel_pose"):
-            if self.splits.items[split]:
+        for split in ("novel_view", "novel_pose", VALIDATION):
+            if self.splits.items.get(split):
                 name = split
         return name, evenly_spaced(len(self.dataset(name)), self.val_images)
 

@@ -14,7 +14,7 @@ from gsgan.body import open_body
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.skeletons import body_height
+from gsgan.data.skeletons import median_limb_length_sum
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import (
     SurfaceColours,
@@ -55,7 +55,7 @@ class SceneInfo:
         skeleton: name of the landmark set.
         n_labels: part labels, background included; 0 without labels.
         label_names: their names, empty if unknown.
-        body_height: metres, median over frames of the summed limb lengths.
+        limb_length_sum: metres, median over frames of the summed limb lengths.
         centre: metres, median position of the person: the middle of the capture volume.
         frames: number of training frames.
         body_file: the user's model file of the body, None for the free body.
@@ -88,7 +88,7 @@ class SceneInfo:
     skeleton: str
     n_labels: int
     label_names: tuple[str, ...]
-    body_height: float
+    limb_length_sum: float
     centre: tuple[float, float, float]
     frames: int
 
@@ -172,7 +172,7 @@ def scene_info(
         skeleton=layout.meta.skeleton,
         n_labels=count_labels(layout, items),
         label_names=layout.meta.label_names or (),
-        body_height=body_height(p, valid),
+        limb_length_sum=median_limb_length_sum(p, valid),
         centre=(x, y, z),
         frames=len(frames),
         body_file=None if body is None else body.file,

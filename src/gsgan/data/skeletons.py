@@ -268,7 +268,9 @@ def hips_below(p: Float, valid: Bool) -> Float:
     else:
         necks = top - p[:, ears].mean(1)
         down = np.median(necks[headed], axis=0)
-        size = body_height(torch.from_numpy(p), torch.from_numpy(valid))
+        size = median_limb_length_sum(
+            torch.from_numpy(p), torch.from_numpy(valid)
+        )
         reach = MEDIAPIPE33.rest_torso[1] * size / MEDIAPIPE33.limb_length_sum
         down *= reach / np.linalg.norm(down)
 
@@ -297,7 +299,7 @@ def bone_lengths(p: Float, bones: Sequence[tuple[int, int]]) -> Float:
     )
 
 
-def body_height(p: Tensor, valid: Tensor) -> float:
+def median_limb_length_sum(p: Tensor, valid: Tensor) -> float:
     """Metres: the summed limb lengths, median over frames, see `limb_length_sum`."""
     return float(limb_length_sum(p, valid).nanmedian())
 
@@ -350,11 +352,11 @@ def complete_skeletons(
     Args:
         landmarks: of the capture.
         frames: to complete.
-        trained: frames that set the body's height, which gives the length of missing bones.
+        trained: frames that set the sum of limb lengths, which gives the length of missing bones.
         template: of the skeletons.
         hands, face: of the capture, if the template has them.
     """
-    height = body_height(*landmarks.joints(trained))
+    limbs = median_limb_length_sum(*landmarks.joints(trained))
 
     # The landmarks that the template asks for, in its order.
     whole = landmarks
@@ -365,5 +367,5 @@ def complete_skeletons(
 
     # Joints that are seen stay as they are.
     p, visible = whole.joints(frames)
-    completed, _ = sanitise(p, visible, template, height)
+    completed, _ = sanitise(p, visible, template, limbs)
     return replace(whole, p=dict(zip(frames, completed.numpy(), strict=True)))

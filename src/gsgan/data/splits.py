@@ -12,7 +12,7 @@ from gsgan.data.protocol import Protocol
 from gsgan.data.skeletons import Landmarks
 from gsgan.data.validation import spans
 from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
-from gsgan.utils.arrays import Ints
+from gsgan.utils.arrays import Ints, evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.frame_files import LARGEST_FRAME
@@ -30,6 +30,11 @@ OUTLIERS = 0.05
 MAX_LISTED_FRAMES = 10**7
 # training, held-out cameras, held-out frames
 SPLITS = ("train", "novel_view", "novel_pose")
+# a further split, of frames cut from the training frames, where it is asked for
+VALIDATION = "validation"
+# what cuts the last share of the training frames
+AUTO = "auto"
+VALIDATION_SHARE = 0.1
 # camera name, frame number
 Item = tuple[str, int]
 
@@ -103,7 +108,8 @@ class Splits:
     """Training and held-out cameras and frames.
 
     ``train`` is train cameras × train frames, ``novel_view`` test cameras × train frames,
-    ``novel_pose`` train cameras × test frames.
+    ``novel_pose`` train cameras × test frames. ``validation``, where it is asked for, is train
+    cameras × validation frames, which are no train frames.
 
     Args:
         items: the existing items, by split.
@@ -128,6 +134,7 @@ def make_splits(
     test_frames: Any = None,
     test_share: float = 0.2,
     train_poses: int | None = None,
+    validation_frames: Any = None,
 ) -> Splits:
     """Splits a capture by cameras and by frames.
 
@@ -141,6 +148,8 @@ def make_splits(
         train_frames, test_frames: numbers and "a-b" ranges (both ends included), or None.
         test_share: in [0, 1), the share of frames held out by default.
         train_poses: maximum number of train frames, see `spread_frames`; None uses all.
+        validation_frames: train frames that become validation frames, as train_frames; "auto" takes
+            the last `VALIDATION_SHARE` of them, None none.
 
     Raises:
         DataError: when a camera does not exist, or nothing is left to train on.
@@ -183,6 +192,11 @@ def make_splits(
 
     # Only items that exist.
     usable, notes = _usable(layout, wanted, "of the splits")
+    validation: list[int] = []
+    if validation_frames is not None:
+        validation = _validation(usable.train, validation_frames)
+        left = set(usable.train).difference(validation)
+        usable = usable._replace(train=tuple(sorted(left)))
     if train_poses is not None:
         maximum = whole("data.train_poses", train_poses, 1)
         spread = spread_frames(layout.landmarks, usable.train, maximum)
@@ -192,6 +206,8 @@ def make_splits(
         "novel_view": _items(layout, cameras.test, usable.train),
         "novel_pose": _items(layout, cameras.train, usable.test),
     }
+    if validation:
+        items[VALIDATION] = _items(layout, cameras.train, validation)
 
     # The reasons if one of them is empty.
     reasons = {
@@ -199,6 +215,20 @@ def make_splits(
         "novel_pose": "no frame is held out (data.test_frames)",
     }
     return _splits(layout, cameras, usable, items, reasons, notes)
+
+
+def _validation(train: Sequence[int], given: Any) -> list[int]:
+    """The validation frames among the train frames."""
+    if given == AUTO:
+        count = max(1, int(VALIDATION_SHARE * len(train)))
+        return list(train[-count:])
+    chosen = parse_frames(given, "data.validation_frames")
+    if not set(chosen) <= set(train):
+        raise ConfigError(
+            "data.validation_frames must be training frames, but "
+            f"{min(set(chosen).difference(train))} is none"
+        )
+    return list(chosen)
 
 
 def spread_frames(
@@ -222,6 +252,29 @@ def spread_frames(
     poses = pose_in_pelvis(p[usual])
     chosen = usual[farthest_points(poses, min(maximum, len(usual)))]
     return sorted({frames[i] for i in chosen.tolist()})
+
+
+def spread_items(items: Sequence[Item], count: int) -> list[int]:
+    """The places, rising, of at most ``count`` items: an image of every frame first, then a second
+    image of every frame, and so on. Cameras take turns from frame to frame."""
+    # The places of each frame's items, beginning with another camera in each.
+    by_frame: dict[int, list[int]] = {}
+    for place, (_, frame) in enumerate(items):
+        by_frame.setdefault(frame, []).append(place)
+    turned = []
+    for i, frame in enumerate(sorted(by_frame)):
+        own = by_frame[frame]
+        first = i % len(own)
+        turned.append(own[first:] + own[:first])
+
+    # Rounds over all frames; the last one takes some of them, evenly spaced.
+    chosen: list[int] = []
+    for nth in range(max(map(len, turned), default=0)):
+        places = [own[nth] for own in turned if nth < len(own)]
+        left = min(count - len(chosen), len(places))
+        if left > 0:
+            chosen += [places[i] for i in evenly_spaced(len(places), left)]
+    return sorted(chosen)
 
 
 def _usable(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gsgan.effects.record import LEFT_OUT, OFF, Effect, Effects
+from gsgan.effects.record import OFF, Effect, Effects
 from gsgan.utils.checks import is_number, one_of
 from gsgan.utils.errors import ConfigError
 
@@ -25,10 +25,7 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "random_background": ON_OFF,
     "registration": ON_OFF,
     "light": ON_OFF,
-    "generator": ON_OFF,
 }
-# Parts of the camera and of the method: effects.only and effects=none keep them.
-KEPT = ("distortion", "generator")
 
 # Reasons that more than one rule gives.
 FORCED = "set in the config"
@@ -59,7 +56,6 @@ class EffectSettings:
     random_background: str | bool = AUTO
     registration: str | bool = AUTO
     light: str | bool = AUTO
-    generator: str | bool = AUTO
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
     only: Sequence[str] | None = None
@@ -77,7 +73,6 @@ class EffectSettings:
     texture: float = 0.6
     pixels_per_metre: float = 150.0
     degrees_seen: float = 300.0
-    gaussians_per_pixel: float = 1.0
 
     def __post_init__(self) -> None:
         # Each requested value is one of the effect's.
@@ -122,9 +117,9 @@ class EffectSettings:
         if self.only is None:
             return value
 
-        # Effects that are not listed are off.
+        # Effects that are not listed are off, but for the lens, which is the camera's.
         if name not in self.only:
-            return value if name in KEPT else "off"
+            return value if name == "distortion" else "off"
 
         # Listed effects are on.
         return "on" if value in (AUTO, "off", 0) else value
@@ -139,22 +134,17 @@ class ModelParts:
         points: it places Gaussians on the skeleton.
         network: Ψ is a network.
         body_points: its config has a part that places them on a body instead.
-        generator: it has a generator.
-        gaussians: Gaussians per pixel of the person in training images, if they are on a body;
-            None where that is not known.
     """
 
     splats: bool = True
     points: bool = True
     network: bool = True
     body_points: bool = True
-    generator: bool = True
-    gaussians: float | None = None
 
     def lacks(self, effect: str) -> str | None:
         """The reason why the model cannot have an effect; None if it can."""
-        # Images are undistorted before any model sees them; a generator needs no Gaussians.
-        if effect in ("distortion", "generator"):
+        # Images are undistorted before any model sees them.
+        if effect == "distortion":
             return None
         if effect == "body_points":
             if not self.points:
@@ -179,7 +169,7 @@ def decide(
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
     """
-    # Two effects depend on whether Gaussians are on a body; all others decide by themselves.
+    # Registration depends on whether Gaussians are on a body; all others decide by themselves.
     model = model or ModelParts()
     on_body = _one("body_points", info, settings, model)
     found = {
@@ -196,10 +186,6 @@ def _one(
     model: ModelParts,
     body_points: Effect | None = None,
 ) -> Effect:
-    # Whether to have a generator at all is the model's choice.
-    if name == "generator" and not model.generator:
-        return Effect(OFF, LEFT_OUT)
-
     # Off by request.
     requested = settings.requested(name)
     off: str | int = 0 if name == "view_dependence" else OFF
@@ -219,8 +205,6 @@ def _one(
         return Effect("undistort" if reason == RATIONAL else off, reason)
 
     # Decided by rule, or forced; "on" stands for the usual mode or degree.
-    if requested == AUTO and name == "generator":
-        return _generator(model, settings, on_body)
     if requested == AUTO:
         return _RULES[name](info, settings)
     if name == "distortion" and requested == "on":
@@ -384,27 +368,6 @@ def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
     if info.degrees_seen < settings.degrees_seen:
         return Effect(OFF, measured)
     return Effect("on", measured)
-
-
-def _generator(
-    model: ModelParts, settings: EffectSettings, on_body: bool
-) -> Effect:
-    # Without Gaussians nothing else paints; Alg. 1's points are far from the surface.
-    if not model.splats:
-        return Effect("on", "this model has no Gaussians: nothing else paints")
-    if not on_body:
-        return Effect("on", "Gaussians start from the skeleton's shapes")
-    if model.gaussians is None:
-        return Effect("on", "the number of Gaussians is not known")
-
-    # Where Gaussians are as dense as pixels, their own colours are as sharp as the generator's.
-    measured = (
-        f"{model.gaussians:.2g} Gaussians per pixel of the person "
-        f"(limit {settings.gaussians_per_pixel:g})"
-    )
-    if model.gaussians < settings.gaussians_per_pixel:
-        return Effect("on", measured)
-    return Effect(OFF, f"{measured}: Step I's colour is as good")
 
 
 # The rule that decides each effect if its value is `auto`.

@@ -11,7 +11,6 @@ from rich.table import Table
 from gsgan.utils.errors import ConfigError
 
 OFF = "off"
-LEFT_OUT = "the model leaves it out"  # why an effect is off
 HEADERS = ("effect", "", "why")
 
 
@@ -52,7 +51,6 @@ class Effects:
         random_background: Step I compares images over a random colour.
         registration: before Ψ learns, optical flow locates the surface in the training images.
         light: colours are multiplied by a light that all points share.
-        generator: the image is the generator's; else it is Step I's colour.
         cameras: training cameras in the order of the colour corrections.
     """
 
@@ -65,8 +63,6 @@ class Effects:
     random_background: Effect = _DEFAULT
     registration: Effect = _DEFAULT
     light: Effect = _DEFAULT
-    # Models without one had none before this effect existed, and all others had one.
-    generator: Effect = Effect("on", _DEFAULT.why)
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
@@ -77,13 +73,6 @@ class Effects:
     def degree(self) -> int:
         """Degree of the spherical harmonics."""
         return int(self.view_dependence.value)
-
-    @property
-    def marks(self) -> list[str]:
-        """Notes that scores must carry, since the model's name says otherwise."""
-        if self.generator.on or self.generator.why == LEFT_OUT:
-            return []
-        return [f"without the model's generator: {self.generator.why}"]
 
     def rows(self) -> list[tuple[str, str, str]]:
         """One row per effect: name, value, why."""

@@ -1,7 +1,7 @@
 """The results of an evaluation: metrics.json, scores.csv, facts.json and tables of the scores."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,25 +26,19 @@ HEADER = ("split", "variant", "camera", "frame", *METRICS)
 # {split: {variant: {metric: value}}}
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
-# A terminal is narrow; metrics.md has all metrics.
-IN_TERMINAL = (
+# The first tables; those without any score are left out.
+SHOWN = (
     "psnr",
     "psnr_person",
-    "ssim",
     "lpips_vgg",
     "lpips_alex",
-    "high_frequencies",
-    "miou",
-)
-# the columns if hands are scored
-WITH_HANDS = (
-    "psnr",
-    "psnr_person",
-    "psnr_hands",
-    "psnr_mouth",
     "ssim",
-    "lpips_alex",
     "miou",
+    "psnr_hands",
+)
+OVER_POSES = "± over poses"
+SPREAD = (
+    f"{OVER_POSES}: standard deviation over poses of the mean of their images"
 )
 
 
@@ -95,35 +89,40 @@ def write_scored(scored: Scored, folder: Path) -> None:
 # -- tables
 
 
+def shown_metrics(results: Results) -> list[str]:
+    """The metrics of the first tables, those that any split has."""
+    finals = [variants[FULL] for variants in results.values()]
+    return [
+        metric
+        for metric in SHOWN
+        if any(scores[metric] is not None for scores in finals)
+    ]
+
+
+def formatted(values: Mapping[str, Any], metric: str, end: str = "") -> str:
+    """A score, rounded to the digits of its metric; None is ``n/a``."""
+    value = values.get(metric + end)
+    if value is None:
+        return "n/a"
+    return f"{value:.{METRICS[metric].digits}f}"
+
+
 def rows(
-    results: Results,
-    metrics: Sequence[str] = tuple(METRICS),
+    variants: Mapping[str, dict[str, Any]],
+    metrics: Sequence[str],
     *,
     cameras: bool = False,
 ) -> Iterator[list[str]]:
-    """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
-
-    def formatted(values: dict[str, Any]) -> list[str]:
-        # Rounded to the digits of each metric.
-        cells = []
-        for metric in metrics:
-            value = values[metric]
-            digits = METRICS[metric].digits
-            cells.append("n/a" if value is None else f"{value:.{digits}f}")
-        return cells
-
-    # One row per variant, and below it one per camera.
-    for split, variants in results.items():
-        for variant, scores in variants.items():
-            yield [
-                split,
-                VARIANTS[variant],
-                str(scores["images"]),
-                *formatted(scores),
-            ]
-            if cameras:
-                for camera, means in scores["cameras"].items():
-                    yield [split, f"  {camera}", "", *formatted(means)]
+    """One formatted row per variant of a split, and below it one of the deviation over poses or,
+    if ``cameras``, one per camera."""
+    for variant, scores in variants.items():
+        yield [VARIANTS[variant], *(formatted(scores, x) for x in metrics)]
+        if cameras:
+            for camera, means in scores["cameras"].items():
+                yield [f"  {camera}", *(formatted(means, x) for x in metrics)]
+        elif any(f"{metric}_over_poses" in scores for metric in metrics):
+            cells = [formatted(scores, x, "_over_poses") for x in metrics]
+            yield [f"  {OVER_POSES}", *cells]
 
 
 def notes(results: Results) -> list[str]:
@@ -132,6 +131,7 @@ def notes(results: Results) -> list[str]:
     found: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants[FULL]
+        found |= dict.fromkeys(_spread_notes(scores))
 
         # The inputs of the metrics, and marks.
         described = scores.get("lpips_input")
@@ -164,6 +164,12 @@ def notes(results: Results) -> list[str]:
     return list(found)
 
 
+def _spread_notes(scores: Mapping[str, Any]) -> list[str]:
+    """What the deviations over poses are, if there are any."""
+    some = any(key.endswith("_over_poses") for key in scores)
+    return [SPREAD] if some else []
+
+
 def _protocol_notes(protocol: dict[str, Any]) -> Iterator[str]:
     """The protocol, and the departures from it."""
     # A remark of the protocol follows its source.
@@ -177,26 +183,20 @@ def print_table(
     results: Results, origin: dict[str, Any], console: Console
 ) -> None:
     """Prints the table, its caption and its notes."""
-    # Columns of metrics; those of hands only if they were scored.
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("variant", no_wrap=True)
-    hands = any(
-        scores[FULL]["psnr_hands"] is not None for scores in results.values()
-    )
-    shown = WITH_HANDS if hands else IN_TERMINAL
-    for metric in shown:
-        table.add_column(
-            METRICS[metric].short_heading, justify="right", no_wrap=True
-        )
+    table.add_column("image", no_wrap=True)
+    metrics = shown_metrics(results)
+    for metric in metrics:
+        heading = METRICS[metric].short_heading
+        table.add_column(heading, justify="right", no_wrap=True)
 
     # The split is a row of its own: a column for it would not fit a narrow terminal.
-    previous = None
-    for split, variant, images, *scores in rows(results, shown):
-        if split != previous:
-            table.add_section()
-            table.add_row(f"[bold]{split}[/bold], {images} images")
-            previous = split
-        table.add_row(variant, *scores)
+    for split, variants in results.items():
+        table.add_section()
+        images = variants[FULL]["images"]
+        table.add_row(f"[bold]{split}[/bold], {images} images")
+        for row in rows(variants, metrics):
+            table.add_row(*row)
 
     # The caption and the notes are not part of the table: they would widen its columns.
     console.print(table)
@@ -205,22 +205,33 @@ def print_table(
 
 
 def markdown(results: Results, origin: dict[str, Any]) -> str:
-    """The table in Markdown with its caption and every metric, and again by camera."""
-    # Every metric is a column.
-    header = ["split", "variant", "images"]
-    for metric in METRICS.values():
-        header.append(metric.short_heading)
-    by_split = pages.markdown(header, list(rows(results)))
-    by_camera = pages.markdown(header, list(rows(results, cameras=True)))
-    listed = "\n".join(f"- {note}" for note in notes(results))
+    """The tables in Markdown with their caption: a few metrics for reading, then every metric, and
+    the few by camera."""
+    metrics = shown_metrics(results)
+    headings = [METRICS[metric].short_heading for metric in metrics]
+    first = []
+    whole = ["## All metrics"]
+    by_camera = ["## By camera"]
+    for split, variants in results.items():
+        # A few metrics.
+        header = ["image", *headings]
+        images = variants[FULL]["images"]
+        first.append(f"**{split}**, {images} images")
+        first.append(pages.markdown(header, list(rows(variants, metrics))))
 
-    # An empty list of notes takes no line.
-    parts = (
-        f"# {TITLE}",
-        caption(origin),
-        by_split,
-        listed,
-        "## By camera",
-        by_camera,
-    )
+        # Every metric is a row, so that the table is narrow.
+        lines = []
+        for metric, described in METRICS.items():
+            cells = [formatted(scores, metric) for scores in variants.values()]
+            lines.append([described.heading, *cells])
+        names = [VARIANTS[variant] for variant in variants]
+        whole += [f"**{split}**", pages.markdown(["metric", *names], lines)]
+
+        # The few by camera.
+        cameras = list(rows(variants, metrics, cameras=True))
+        by_camera += [f"**{split}**", pages.markdown(header, cameras)]
+
+    # Notes follow the tables for reading.
+    listed = "\n".join(f"- {note}" for note in notes(results))
+    parts = (f"# {TITLE}", caption(origin), *first, listed, *whole, *by_camera)
     return "\n\n".join(filter(None, parts)) + "\n"

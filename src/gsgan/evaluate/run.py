@@ -23,6 +23,7 @@ from rich.console import Console
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
+from gsgan.data.splits import VALIDATION, spread_items
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -308,6 +309,7 @@ def evaluate_folder(
             data = build_data(stored)
         with working(console, "building the avatar"):
             avatar, marks = load_avatar(folder, stored, data)
+        marks = [*marks, *choice_marks(stored, data)]
 
     # Scores of other settings have folders of their own, so that the protocol's scores stay.
     if config.background not in (None, _measures(data).background):
@@ -339,10 +341,24 @@ def evaluate_folder(
         predict=painter(avatar.to(device), solve=solve, colours=not other),
         method=method,
         device=device,
-        marks=[*marks, *avatar.effects.marks],
+        marks=marks,
         poses=avatar.poses,
         beside=folder if other else None,
     )
+
+
+def choice_marks(config: DictConfig, data: GsganData) -> list[str]:
+    """Notes that held-out images have chosen something about a run of this config, so that its
+    scores on them are no test of it."""
+    marks = []
+    if data.watched[0] in HELD_OUT_SPLITS:
+        for name, settings in (config.get("callbacks") or {}).items():
+            if str(settings.get("monitor")).startswith("val/"):
+                marks.append(f"callbacks.{name} watched held-out images")
+    objective = config.get("objective")
+    if objective is not None and objective.split(".")[0] in HELD_OUT_SPLITS:
+        marks.append(f"a search compared runs by objective={objective}")
+    return marks
 
 
 def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
@@ -489,12 +505,17 @@ def evaluate_method(
     """
     scorer = make_scorer(options, data, marks)
 
+    # Validation frames are scored with the held-out splits, for searches.
+    splits = list(options.splits)
+    if set(splits) == set(HELD_OUT_SPLITS) and VALIDATION in data.splits.items:
+        splits.append(VALIDATION)
+
     # Every split, or some of its images. Only scores of a run are kept until all are there.
     scores: dict[str, SplitScores] = {}
-    for split in options.splits:
+    for split in splits:
         dataset = data.dataset(split)
-        count = len(dataset)
-        places = evenly_spaced(count, options.score_images or count)
+        maximum = options.score_images or len(dataset)
+        places = spread_items(dataset.items, maximum)
 
         # Scores of a trained method are kept: a run that was interrupted goes
         # on.
@@ -642,7 +663,9 @@ def make_scorer(
     # Some images of each split alone.
     if options.score_images is not None:
         maximum = whole("score_images", options.score_images, 1)
-        marks.append(f"at most {maximum} evenly spaced images of each split")
+        marks.append(
+            f"at most {maximum} images of each split, spread over its frames first"
+        )
 
     # The protocol, and what departs from it.
     boxes = BodyBoxes(data) if measures.needs_body_box else None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -194,6 +195,19 @@ def means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return result
 
 
+def over_poses(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """``{metric_over_poses: deviation}``: the sample standard deviation over frames of the mean of
+    each frame's images, for metrics that at least two frames have."""
+    frame = pd.DataFrame(rows)
+    metrics = [metric for metric in METRICS if metric in frame]
+    finite = frame[metrics].astype(float).replace([math.inf, -math.inf], None)
+    deviations = finite.groupby(frame["frame"]).mean().std()
+    return {
+        f"{metric}_over_poses": float(deviation)
+        for metric, deviation in deviations.dropna().items()
+    }
+
+
 # -- a split
 
 
@@ -232,8 +246,8 @@ class SplitScores:
 def painter(
     avatar: Avatar, *, solve: bool = False, colours: bool = True
 ) -> Predict:
-    """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
-    each with its own alpha.
+    """The predictions of an avatar in eval mode: I_pred as ``full`` and, where a generator painted
+    it, Step I's colour as ``splat``, each with its own alpha.
 
     Args:
         avatar: to evaluate.
@@ -253,7 +267,7 @@ def painter(
         assert painting.image is not None
         images = {FULL: painting.image}
         alphas = {FULL: painting.alpha}
-        if painting.colour is not None:
+        if painting.colour is not None and avatar.generator is not None:
             images[SPLAT] = painting.colour
             alphas[SPLAT] = painting.splat_alpha
 
@@ -500,8 +514,8 @@ def _variant(
     scorer: Scorer,
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
-    # Means over all images.
-    result = means(rows)
+    # Means over all images, and how much poses differ.
+    result = means(rows) | over_poses(rows)
 
     # Reasons for metrics that cannot be computed.
     if describe_boxes(scorer.prepare.skeleton) is None:

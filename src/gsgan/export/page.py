@@ -212,9 +212,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     # The header: bounds of the residuals in metres, and the settings of the rasteriser.
     settings = avatar.accuracy
     stretch = on_body.stretch_limit
-    scales = [
-        math.log(limit * linear.body_height) for limit in linear.scale_range
-    ]
+    scales = [math.log(limit * linear.stature) for limit in linear.scale_range]
     header: Plain = {
         "count": len(table),
         "degree": degree,
@@ -224,8 +222,8 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
         "slopeStep": float(slope_step),
         "stretch": stretch if math.isfinite(stretch) else None,
         "range": (low, step),
-        "bound": (linear.mean_bound or 0) * linear.body_height,
-        "height": linear.body_height,
+        "bound": (linear.mean_bound or 0) * linear.stature,
+        "height": linear.stature,
         "scales": scales,
         "logit": linear.logit_bound,
         "lowPass": settings.low_pass,

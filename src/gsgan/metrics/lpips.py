@@ -5,13 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.metrics.image import person_box
 from gsgan.metrics.regions import BACKGROUNDS, mask_crop, rectangle
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
-from gsgan.weights.networks import MIN_PIXELS, Lpips
+from gsgan.weights.networks import MIN_PIXELS, Lpips, mean_distance, unit
+from gsgan.weights.parts import union
 
 LPIPS_NETS = ("vgg", "alex")
 # The scores of an image by metric.
@@ -40,6 +42,9 @@ def build_lpips(
 
 class LpipsAgainst:
     """LPIPS against one ground truth, whose features are computed once for all images.
+
+    Where both images show the background, their features are equal and the distance is 0, so
+    features are computed of what else the images show, see `gsgan.weights.parts`.
 
     Args:
         target: ``[1, 3, H, W]``, prepared, in [0, 1].
@@ -73,13 +78,18 @@ class LpipsAgainst:
             )
 
         # The ground truth's features, of the whole image and of the square.
+        behind = torch.full_like(target, BACKGROUNDS[self.measures.background])
+        background = self._seen(behind)
         whole = self._seen(target)
         square = self._square(target)
+        self.backgrounds = {}
         self.truth = {}
         self.square_truth = {}
         for net, network in networks.items():
             network.to(target.device)
-            self.truth[net] = network.features(whole)
+            normalised = network.network.normalised
+            self.backgrounds[net] = network.background(normalised(background))
+            self.truth[net] = self.backgrounds[net].differing(normalised(whole))
             if square is not None:
                 self.square_truth[net] = network.features(square)
 
@@ -95,14 +105,11 @@ class LpipsAgainst:
         square = self._square(image)
         scores = {}
         for net, network in self.networks.items():
-            truth = self.truth[net]
-            features = network.features(whole)
+            layers = self._layers(net, whole)
 
             # The score of the region that the protocol asks for.
             if self.measures.lpips_region == "full":
-                scores[f"lpips_{net}"] = float(
-                    network.distance(features, truth)
-                )
+                scores[f"lpips_{net}"] = float(mean_distance(layers))
             elif square is None:
                 scores[f"lpips_{net}"] = math.nan
             else:
@@ -110,16 +117,51 @@ class LpipsAgainst:
                 distance = network.distance(own, self.square_truth[net])
                 scores[f"lpips_{net}"] = float(distance)
 
-            # The score in the person's box, from the map of the whole image.
+            # The score in the person's box: the maps of the whole image, enlarged to its size.
             if self.mask is not None:
-                # The box of the person, from the same features.
                 inside = math.nan
                 if self.box is not None:
                     rows, columns = self.box
-                    distances = network.distance_map(features, truth, self.size)
+                    distances = torch.zeros_like(image[:, :1])
+                    for layer in layers:
+                        distances += functional.interpolate(
+                            layer, self.size, mode="bilinear"
+                        )
                     inside = float(distances[:, :, rows, columns].mean())
                 scores[f"lpips_{net}_person"] = inside
         return scores
+
+    def _layers(self, net: str, image: Tensor) -> list[Tensor]:
+        """The distance's map ``[1, 1, h, w]`` of each layer: 0 where both images show the
+        background, and computed elsewhere."""
+        background = self.backgrounds[net]
+        truth = self.truth[net]
+        own = background.differing(self.networks[net].network.normalised(image))
+        shown = list(filter(None, (own, truth)))
+        if not shown:
+            return [torch.zeros_like(x[:, :1]) for x in background.maps]
+
+        # The features of both images where either differs from the background.
+        features: list[Tensor] = []
+        others: list[Tensor] = []
+        padding = []
+        for stage, whole in enumerate(background.maps):
+            rows = union([parts[stage].rows for parts in shown])
+            columns = union([parts[stage].columns for parts in shown])
+            features.append(unit(background.on(stage, own, rows, columns)))
+            others.append(unit(background.on(stage, truth, rows, columns)))
+
+            # The rest of the map: left, right, above and below.
+            height, width = whole.shape[-2:]
+            sides = (columns[0], width - columns[1])
+            padding.append((*sides, rows[0], height - rows[1]))
+
+        # The maps, with zeros around.
+        layers = self.networks[net].layers(features, others)
+        return [
+            functional.pad(layer, beyond)
+            for layer, beyond in zip(layers, padding, strict=True)
+        ]
 
     def _seen(self, image: Tensor) -> Tensor:
         """The image with the protocol's channels and range, as the networks get it."""

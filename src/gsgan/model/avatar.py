@@ -131,7 +131,7 @@ class Avatar(nn.Module):
         accuracy: the rasteriser's settings for F.
         template: of the skeletons that drive it.
         limb_length_sum: metres, the subject's summed limb lengths.
-        body_height: metres, the subject's stature: the length scale of the networks' inputs.
+        stature: metres, the subject's stature: the length scale of the networks' inputs.
         deformation: Ψ; with it either densify (Alg. 1) or body_points places G.
         surface: Gaussians on the body's surface, in place of Ψ (``lbs_splat``).
         segmentation: S, or None (``wo_seg``); segmentation_why says where its labels come from, or
@@ -160,7 +160,7 @@ class Avatar(nn.Module):
         effects: Effects,
         accuracy: Accuracy,
         limb_length_sum: float,
-        body_height: float,
+        stature: float,
         template: SkeletonTemplate = MEDIAPIPE33,
         deformation: ResidualGaussians | None = None,
         densify: Densify | None = None,
@@ -186,7 +186,7 @@ class Avatar(nn.Module):
         self.accuracy = accuracy
         self.backend = backend
         self.limb_length_sum = limb_length_sum
-        self.body_height = body_height
+        self.stature = stature
         self.template = template
         self.window_margin = window_margin
         self.window_multiple = window_multiple
@@ -505,7 +505,7 @@ class Avatar(nn.Module):
                 posed.frames,
                 camera,
                 self.template,
-                self.body_height,
+                self.stature,
             )
         return GeneratorInputs(S, drawn, pose)
 

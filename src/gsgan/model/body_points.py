@@ -36,6 +36,9 @@ FOLLOWED_BONES = 6
 AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
+# Points per pixel of the person from which Step I's colour has scored as well as the generator's
+# image (docs/ablations.md#who-needs-the-generator).
+DENSE = 1.0
 MIN_POINTS = 5000
 MAX_POINTS = 100_000
 # a possible weight below it starts there, so that it can grow
@@ -315,7 +318,7 @@ class BodyPoints(nn.Module):
 
     Args:
         body: vertices, weights and joints.
-        body_height: metres, the length scale of Ψ's input.
+        stature: metres, the length scale of Ψ's input.
         points: number of points: vertices spread evenly over the surface, or, if the body has
             fewer, all of them and the middles of its longest edges; None for all vertices; "auto"
             for `points_for` the training images.
@@ -346,7 +349,7 @@ class BodyPoints(nn.Module):
     def __init__(
         self,
         body: SkinnedBody,
-        body_height: float,
+        stature: float,
         *,
         points: int | str | None = None,
         scale: float = 1.0,
@@ -365,7 +368,7 @@ class BodyPoints(nn.Module):
 
         # The number of points; a mesh with too few vertices is subdivided.
         if points == AUTO:
-            points = points_for(body_height, scale, spacing)
+            points = points_for(stature, scale, spacing)
         if points is not None:
             points = whole("model.body_points.points", points, 1)
             body = subdivided(body, points)
@@ -394,10 +397,10 @@ class BodyPoints(nn.Module):
         if scale_spacings is not None:
             above("model.body_points.scale_spacings", scale_spacings)
             spacing = float(self.points.spacing.median())
-            self.scale_max = scale_spacings * spacing / body_height
+            self.scale_max = scale_spacings * spacing / stature
 
         # Places at rest tell Ψ one point from another; normals move with the pose.
-        rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
+        rest = (self.points.means - self.points.means.mean(dim=0)) / stature
         self.register_buffer("rest_points", rest, persistent=False)
         normals = vertex_normals(body.vertices.float(), body.faces)[
             self.points.chosen
@@ -537,35 +540,35 @@ class BodyPoints(nn.Module):
         return means, A, t, jacobian, normals
 
 
-def points_for(body_height: float, scale: float, spacing: float) -> int:
+def points_for(stature: float, scale: float, spacing: float) -> int:
     """The number of points that are ``spacing`` pixels apart, on average, in training images.
 
     It is a multiple of 100 between the bounds `MIN_POINTS` and `MAX_POINTS`.
 
     Args:
-        body_height: metres.
+        stature: metres.
         scale: pixels per metre at the person.
         spacing: pixels.
     """
     above("model.body_points.spacing", spacing)
 
     # The skin's area grows with the square of the stature.
-    area = SKIN * (body_height / STATURE) ** 2
+    area = SKIN * (stature / STATURE) ** 2
     count = area * (scale / spacing) ** 2
     return int(min(max(MIN_POINTS, round(count, -2)), MAX_POINTS))
 
 
-def points_per_pixel(count: int, body_height: float, scale: float) -> float:
+def points_per_pixel(count: int, stature: float, scale: float) -> float:
     """Points on a body per pixel that the person covers in training images.
 
     Args:
         count: points.
-        body_height: metres.
+        stature: metres.
         scale: pixels per metre at the person.
 
     Source: the mean projected area of a convex body is a quarter of its surface (Cauchy).
     """
-    area = SKIN * (body_height / STATURE) ** 2
+    area = SKIN * (stature / STATURE) ** 2
     return 4 * count / (area * scale**2)
 
 

@@ -35,7 +35,7 @@ class Deformation(ResidualGaussians):
 
     Args:
         rest_points: ``[N, 3]`` points on the rest skeleton, in body heights (the point's identity).
-        body_height: metres, the subject's constant length scale.
+        stature: metres, the subject's constant length scale.
         joints: joints in the skeleton.
         width, layers: the MLP's trunk.
         embedding: learned numbers per anchor.
@@ -64,7 +64,7 @@ class Deformation(ResidualGaussians):
     def __init__(
         self,
         rest_points: Tensor,
-        body_height: float,
+        stature: float,
         joints: int = 33,
         *,
         width: int = 256,
@@ -79,7 +79,7 @@ class Deformation(ResidualGaussians):
         light: str | None = None,
         **settings: Any,
     ) -> None:
-        super().__init__(body_height, **settings)
+        super().__init__(stature, **settings)
         between(
             "model.deformation: layers",
             whole("model.deformation: layers", layers, 2),
@@ -192,7 +192,7 @@ class Deformation(ResidualGaussians):
 
     def _places(self, means: Tensor, root: Tensor) -> Tensor:
         """Means ``[B, N, 3]`` about the root, in body heights."""
-        return (means - root[:, None]) / self.body_height
+        return (means - root[:, None]) / self.stature
 
     def _within(self, code: Tensor, limit: float) -> Tensor:
         """The code nearest to ``[B, 3 J]`` among those that vary as the training poses' do, by

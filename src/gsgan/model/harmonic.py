@@ -59,7 +59,7 @@ class Harmonic(ResidualGaussians):
 
     Args:
         rest_points: ``[N, 3]``; only their number is used.
-        body_height: metres, the subject's constant length scale.
+        stature: metres, the subject's constant length scale.
         joints: not used.
         follow: names of `Residuals` that follow the normals; the others are constant.
         settings: of `ResidualGaussians`.
@@ -70,13 +70,13 @@ class Harmonic(ResidualGaussians):
     def __init__(
         self,
         rest_points: Tensor,
-        body_height: float,
+        stature: float,
         joints: int = 33,
         *,
         follow: Sequence[str] = FOLLOW,
         **settings: Any,
     ) -> None:
-        super().__init__(body_height, **settings)
+        super().__init__(stature, **settings)
         for name in follow:
             one_of("model.deformation.follow", name, tuple(RATES))
         count = len(rest_points)
@@ -216,7 +216,7 @@ def distilled(
     settings: dict[str, Any] = {name: getattr(psi, name) for name in same}
     settings["scale_min"], settings["scale_max"] = psi.scale_range
     fitted = Harmonic(
-        avatar.rest_points, psi.body_height, follow=follow, **settings
+        avatar.rest_points, psi.stature, follow=follow, **settings
     ).to(avatar.rest_points.device)
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.

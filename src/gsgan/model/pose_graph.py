@@ -149,7 +149,7 @@ def pose_inputs(
     frames: BoneFrames,
     camera: Camera,
     template: SkeletonTemplate,
-    body_height: float,
+    stature: float,
 ) -> tuple[Tensor, Tensor]:
     """The inputs of both encoders.
 
@@ -158,7 +158,7 @@ def pose_inputs(
         frames: of the bones.
         camera: B cameras.
         template: of the skeleton.
-        body_height: metres.
+        stature: metres.
 
     Returns:
         Ω ``[B, J, 6]``, and joints ``[B, J, 3]`` about the root in camera axes and body heights,
@@ -166,7 +166,7 @@ def pose_inputs(
     """
     # Joints in camera axes, so that g depends on what the camera sees of the pose.
     root = root_of(p, template).unsqueeze(1)
-    in_camera = (p - root) @ camera.R.mT / body_height
+    in_camera = (p - root) @ camera.R.mT / stature
 
     # Landmarks of the face have a code of their own.
     if (face := face_code(p, frames.head, template)) is not None:

@@ -42,7 +42,7 @@ class ResidualGaussians(nn.Module):
     isotropic, grey, half transparent.
 
     Args:
-        body_height: metres, the subject's constant length scale.
+        stature: metres, the subject's constant length scale.
         features: channels beside the three of colour.
         mean_step: what residuals of means are multiplied by: with Adam, how fast means move.
         sh_degree: 0 (no view dependence) to 3.
@@ -54,7 +54,7 @@ class ResidualGaussians(nn.Module):
 
     def __init__(
         self,
-        body_height: float,
+        stature: float,
         *,
         features: int = 29,
         sh_degree: int = 1,
@@ -69,7 +69,7 @@ class ResidualGaussians(nn.Module):
         one_of("model.deformation: sh_degree", sh_degree, range(4))
 
         # Lengths of the network are in body heights.
-        self.body_height = float(body_height)
+        self.stature = float(stature)
 
         # Channels of F beside colour, and the harmonics of colour.
         self.features = features
@@ -173,7 +173,7 @@ class ResidualGaussians(nn.Module):
         """Means, covariances and opacities; in compiled code where that is possible."""
         # Bounds of means and scales are body heights, so they become metres here.
         bound = self.mean_bound
-        height = self.body_height
+        height = self.stature
         low, high = (math.log(limit * height) for limit in self.scale_range)
         logit = math.log(self.opacity / (1 - self.opacity))
 
@@ -226,10 +226,8 @@ class ResidualGaussians(nn.Module):
         """Residuals ``[B, N, 3]`` of means that are moved by ``offset`` besides, metres in the
         frames of their points."""
         if self.mean_bound is None:
-            return means + offset / self.body_height
-        share = torch.tanh(means) + offset / (
-            self.mean_bound * self.body_height
-        )
+            return means + offset / self.stature
+        share = torch.tanh(means) + offset / (self.mean_bound * self.stature)
         return torch.atanh(share.clamp(-MAX_SHARE, MAX_SHARE))
 
     def pose_code(
@@ -249,7 +247,7 @@ class ResidualGaussians(nn.Module):
                 would be a hundredth of the code; None: E is 0.
         """
         # Joints are about the root, so that the person's place in the world changes nothing.
-        code = (p - root[:, None]) / self.body_height
+        code = (p - root[:, None]) / self.stature
 
         # Landmarks of the face have a code of their own.
         if face is not None:

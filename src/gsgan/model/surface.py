@@ -20,7 +20,7 @@ class SurfaceGaussians(SkinnedGaussians):
 
     Args:
         body: vertices, weights and joints.
-        body_height: metres, the length scale of the bounds.
+        stature: metres, the length scale of the bounds.
         points: vertices used, spread evenly over the surface; None for all.
         sh_degree: 0 (no view dependence) to 3.
         opacity, scale: initial values, see `SkinnedGaussians`.
@@ -36,7 +36,7 @@ class SurfaceGaussians(SkinnedGaussians):
     def __init__(
         self,
         body: SkinnedBody,
-        body_height: float,
+        stature: float,
         *,
         points: int | None = None,
         sh_degree: int = 0,
@@ -55,7 +55,7 @@ class SurfaceGaussians(SkinnedGaussians):
         # Colour is splatted alone, without other features.
         self.features = 0
         self.sh_degree = sh_degree
-        self.body_height = float(body_height)
+        self.stature = float(stature)
         # raised during training; higher degrees are not computed
         self.active_degree = sh_degree
 
@@ -64,7 +64,7 @@ class SurfaceGaussians(SkinnedGaussians):
         self.logit_bound = logit_bound
         if scale_spacings is not None:
             spacing = float(self.points.spacing.median())
-            scale_max = scale_spacings * spacing / self.body_height
+            scale_max = scale_spacings * spacing / self.stature
         self.scale_range = (scale_min, scale_max)
 
         # Means start at their vertices, colours at grey.
@@ -85,12 +85,12 @@ class SurfaceGaussians(SkinnedGaussians):
         """The Gaussians in pose, coloured as seen from ``eye`` ``[B, 3]`` (world, metres)."""
         # The means: offsets at rest within a bound, then LBS.
         A, t = self.points.blend(pose)
-        offsets = self.mean_bound * self.body_height * torch.tanh(self.offsets)
+        offsets = self.mean_bound * self.stature * torch.tanh(self.offsets)
         means = skin(self.points.means + offsets, A, t)
 
         # Bounds of the scales in metres, and the harmonics that are active.
         low, high = (
-            math.log(bound * self.body_height) for bound in self.scale_range
+            math.log(bound * self.stature) for bound in self.scale_range
         )
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(
             len(A), -1, -1, -1

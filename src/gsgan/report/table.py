@@ -49,7 +49,7 @@ from gsgan.utils.frame_files import natural_order
 FLOOR_LABEL = "all background (floor)"
 SPREAD_REMARK = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
-    "no spread."
+    "no spread. In brackets: standard deviation over poses of the mean of their images."
 )
 SPLIT_TITLES = {
     "novel_view": " (held-out cameras)",
@@ -132,7 +132,7 @@ class Part:
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """One row per run, variant and column: ``name variant column seed value note``.
+        """One row per run, variant and column: ``name variant column seed value note poses``.
 
         The all-background image is of the data, not of a model or seed, so it has one row per
         column, without a name.
@@ -146,16 +146,19 @@ class Part:
                 # Values that lack carry the reason as a note.
                 for variant in (FULL, SPLAT, FLOOR_VARIANT):
                     value, note = _value(run, self.split, variant, metric)
+                    held = run.of(self.split, variant)
+                    poses = held.get(f"{metric}_over_poses")
                     seed = str(run.seed)
-                    rows.append((run.name, variant, column, seed, value, note))
+                    scored = (value, note, poses)
+                    rows.append((run.name, variant, column, seed, *scored))
 
         # One line per score: pandas then takes means over any of the columns.
-        names = ["name", "variant", "column", "seed", "value", "note"]
-        frame = pd.DataFrame(rows, columns=names)
+        names = ["name", "variant", "column", "seed", "value", "note", "poses"]
+        frame = pd.DataFrame(rows, columns=names).astype({"poses": float})
 
         # Some tables print values times 1000.
         shown_larger = frame.column.map(self.columns).isin(self.spec.times_1000)
-        frame.loc[shown_larger, "value"] *= 1000
+        frame.loc[shown_larger, ["value", "poses"]] *= 1000
 
         # Of equal rows, such as the floors of all runs, one with a value is kept.
         frame.loc[frame.variant == FLOOR_VARIANT, ["name", "seed"]] = (
@@ -218,6 +221,11 @@ class Part:
         if len(values) > 1:
             spread = float(values.std())
             text += f" ± {self.written(metric, spread)}"
+
+        # The deviation over poses is a mean over seeds.
+        poses = own.poses.mean()
+        if not pd.isna(poses):
+            text += f" ({self.written(metric, float(poses))})"
         return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:

@@ -19,12 +19,12 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
-from gsgan.effects.record import LEFT_OUT, OFF
+from gsgan.effects.record import OFF
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import (
     AUTO,
+    DENSE,
     BodyPoints,
-    points_for,
     points_per_pixel,
 )
 from gsgan.model.colour import ColourCorrection
@@ -111,38 +111,16 @@ def build_avatar(
     with naming_group("model"):
         parts: AvatarParts = instantiate(config.model)()
         settings = _effect_settings(config)
-        effects = effects or decide(scene, settings, parts.in_effects(scene))
-
-        # Pose code and S are inputs of the generator.
-        if not effects.generator.on:
-            parts = replace(
-                parts, generator=None, pose_encoder=None, segmentation=None
-            )
-        elif getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
-            gaussians = parts.in_effects(scene).gaussians
-            parts = _with_last_level(parts, gaussians, effects, settings)
+        effects = effects or decide(scene, settings, parts.in_effects)
 
         # S needs the body with a label per vertex.
-        labelled: tuple[SkinnedBody | None, str] = (None, LEFT_OUT)
+        labelled: tuple[SkinnedBody | None, str] = (
+            None,
+            "the model leaves it out",
+        )
         if parts.segmentation is not None:
             labelled = labelled_body(scene, images, vertex_labels)
         return _assembled(parts, scene, effects, labelled, config.seed)
-
-
-def _with_last_level(
-    parts: AvatarParts,
-    gaussians: float | None,
-    effects: Effects,
-    settings: EffectSettings,
-) -> AvatarParts:
-    """The parts with a last level of the generator, or without it where G is as dense as pixels.
-
-    ``gaussians``: on the body, for each pixel of the person; None where that is not known.
-    """
-    assert parts.generator is not None
-    dense = gaussians is not None and gaussians >= settings.gaussians_per_pixel
-    refine = not (effects.body_points.on and dense)
-    return replace(parts, generator=partial(parts.generator, refine=refine))
 
 
 @dataclass(frozen=True)
@@ -205,7 +183,8 @@ class AvatarParts:
                 "nothing paints; give a deformation, a surface or a generator"
             )
 
-    def in_effects(self, scene: SceneInfo) -> ModelParts:
+    @property
+    def in_effects(self) -> ModelParts:
         """The parts that effects act on."""
         return ModelParts(
             splats=self.densify is not None or self.surface is not None,
@@ -214,29 +193,7 @@ class AvatarParts:
                 getattr(self.deformation, "func", object), Deformation
             ),
             body_points=self.body_points is not None,
-            generator=self.generator is not None,
-            gaussians=self._gaussians_per_pixel(scene),
         )
-
-    def _gaussians_per_pixel(self, scene: SceneInfo) -> float | None:
-        """Gaussians on the body per pixel of the person; None without a body."""
-        if self.body_points is None or self.densify is None:
-            return None
-
-        # The number that the config gives, or that of the body's vertices.
-        template = template_of(scene.skeleton, scene.face)
-        height = _body_height(scene, template)
-        scale = scene.scale_train[1]
-        chosen = self.body_points.keywords
-        count = chosen.get("points")
-        if count == AUTO:
-            count = points_for(height, scale, chosen["spacing"])
-        if count is None:
-            body = open_body(scene.body, scene.body_file, scene.betas)
-            if body is None:
-                return None
-            count = len(body.vertices)
-        return points_per_pixel(count, height, scale)
 
 
 def _assembled(
@@ -252,8 +209,8 @@ def _assembled(
     of the others. ``labelled``: S's body, and where its labels come from or why there is none.
     """
     template = template_of(scene.skeleton, scene.face)
-    body_height = _body_height(scene, template)
-    sizes = {"body_height": body_height, "sh_degree": effects.degree}
+    stature = template.stature_of(scene.limb_length_sum)
+    sizes = {"stature": stature, "sh_degree": effects.degree}
     formation: dict[str, Any] = {
         "low_pass": parts.low_pass,
         "antialias": effects.antialias.on,
@@ -261,7 +218,7 @@ def _assembled(
 
     # The points, and Ψ, which moves them; or Gaussians that move with the body alone.
     torch.manual_seed(seed + 1)
-    body_points = _body_points(parts, scene, effects, body_height)
+    body_points = _body_points(parts, scene, effects, stature)
     points = body_points or parts.densify
     deformation = surface = None
     if parts.deformation and points:
@@ -292,7 +249,13 @@ def _assembled(
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
     splats = deformation or surface
-    generator = _generator(parts, template, splats, segmentation)
+    dense = False
+    if body_points is not None:
+        per_pixel = points_per_pixel(
+            len(body_points.points), stature, scene.scale_train[1]
+        )
+        dense = per_pixel >= DENSE
+    generator = _generator(parts, template, splats, segmentation, dense=dense)
     colour = None
     if effects.colour_correction.on:
         colour = ColourCorrection(effects.cameras, scene.camera_names)
@@ -302,8 +265,8 @@ def _assembled(
         accuracy=replace(
             parts.accuracy, supersample=parts.supersample, **formation
         ),
-        limb_length_sum=float(scene.body_height),
-        body_height=body_height,
+        limb_length_sum=scene.limb_length_sum,
+        stature=stature,
         deformation=deformation,
         densify=None if body_points else parts.densify,
         body_points=body_points,
@@ -320,14 +283,14 @@ def _assembled(
 
 
 def _body_points(
-    parts: AvatarParts, scene: SceneInfo, effects: Effects, body_height: float
+    parts: AvatarParts, scene: SceneInfo, effects: Effects, stature: float
 ) -> BodyPoints | None:
     """Points on the skinned body; None where Gaussians start from the skeleton's shapes."""
     if not (parts.densify and parts.body_points and effects.body_points.on):
         return None
     return parts.body_points(
         body=_required_body(scene, "effects.body_points=on"),
-        body_height=body_height,
+        stature=stature,
         scale=scene.scale_train[1],
     )
 
@@ -355,21 +318,25 @@ def _set_by_scene(
     return found
 
 
-def _body_height(scene: SceneInfo, template: SkeletonTemplate) -> float:
-    """The person's stature in metres; it follows from limb lengths, which no pose changes."""
-    limbs = float(scene.body_height)
-    return limbs * template.stature / template.limb_length_sum
-
-
 def _generator(
     parts: AvatarParts,
     template: SkeletonTemplate,
     splats: ResidualGaussians | SurfaceGaussians | None,
     segmentation: Segmentation | None,
+    *,
+    dense: bool,
 ) -> Generator | None:
-    """The UNet; if nothing is splatted, the drawn skeleton takes F's place."""
+    """The UNet; if nothing is splatted, the drawn skeleton takes F's place.
+
+    ``dense``: Gaussians on the body are as many as pixels, which a last level would not sharpen.
+    """
     if parts.generator is None or parts.pose_encoder is None:
         return None
+
+    # A generator of one's own need not have the setting.
+    options: dict[str, Any] = {}
+    if getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
+        options["refine"] = not dense
 
     # Channels of its inputs; F has three for the colour of Step I before its features.
     drawn = len(template.draw_groups)
@@ -379,6 +346,7 @@ def _generator(
         skeleton_channels=drawn if splats else 0,
         pose_channels=parts.pose_encoder.channels,
         supersample=parts.supersample if splats else 1,
+        **options,
     )
 
 

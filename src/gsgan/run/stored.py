@@ -30,6 +30,8 @@ RENAMED_KEYS = {
 }
 # Keys that configs of runs before 2026-11-28 have, and the only value that there is now.
 REMOVED_KEYS = {"model.deformation.pose_frame": "world"}
+# Keys that configs of runs before 2026-11-29 have, and that nothing reads now.
+UNREAD_KEYS = ("effects.generator", "effects.gaussians_per_pixel")
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -142,6 +144,9 @@ def rename_keys(settings: MutableMapping[str, Any]) -> None:
             group[now] = group.pop(last)
 
     # Keys that are gone.
+    for key in UNREAD_KEYS:
+        group, last = _group(settings, key)
+        group.pop(last, None)
     for key, value in REMOVED_KEYS.items():
         group, last = _group(settings, key)
         if group.pop(last, value) != value:
@@ -278,6 +283,10 @@ def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     ):
         if values.get(key) is not None:
             values[key] = kind(**values[key])
+
+    # Called by another name until 2026-11-29.
+    if "body_height" in values:
+        values["limb_length_sum"] = values.pop("body_height")
 
     # Stored until 2026-11-26; nothing depends on it now.
     values.pop("scale_test", None)

@@ -65,7 +65,7 @@ def sanitise(
     p: Tensor,
     visibility: Tensor | None = None,
     template: SkeletonTemplate = MEDIAPIPE33,
-    body_height: Tensor | float | None = None,
+    limb_length_sum: Tensor | float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Fills in unseen joints and marks them.
 
@@ -80,7 +80,7 @@ def sanitise(
         p: ``[B, J, 3]``.
         visibility: ``[B, J]`` or None (all visible).
         template: defines the joints and the rest pose.
-        body_height: the subject's h_body as of :func:`limb_length_sum`, a number or ``[B]``,
+        limb_length_sum: the subject's h_body, see the function of that name, a number or ``[B]``,
             which scales the missing bones. None: from the seen limbs.
 
     Returns:
@@ -109,14 +109,14 @@ def sanitise(
     # Estimated hips are used, but not marked as seen.
     placed = valid | _estimated_hips(p, valid, template)
     _refuse_without_trunk(placed, template)
-    return _filled(p, placed, template, body_height), valid
+    return _filled(p, placed, template, limb_length_sum), valid
 
 
 def complete_skeleton(
     skeleton: Tensor,
     visibility: Tensor | None,
     template: SkeletonTemplate,
-    body_height: float,
+    limb_length_sum: float,
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
 
@@ -126,7 +126,7 @@ def complete_skeleton(
     Args:
         skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres; NaN for joints not seen.
         visibility: ``[J]`` or ``[B, J]`` in [0, 1]; None: all seen.
-        template, body_height: see `sanitise`.
+        template, limb_length_sum: see `sanitise`.
 
     Raises:
         ValueError: as `sanitise` does.
@@ -144,7 +144,7 @@ def complete_skeleton(
         missing = (0, max(J - found, 0))
         p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
         shown = pad(shown[:, :J], missing)
-    p, valid = sanitise(p, None, template, body_height)
+    p, valid = sanitise(p, None, template, limb_length_sum)
     return p, valid * shown
 
 
@@ -193,9 +193,10 @@ def _filled(
     p: Tensor,
     valid: Tensor,
     template: SkeletonTemplate,
-    body_height: Tensor | float | None,
+    known_sum: Tensor | float | None,
 ) -> Tensor:
-    """Joints ``[B, J, 3]`` with the unseen ones placed, from the trunk outwards."""
+    """Joints ``[B, J, 3]`` with the unseen ones placed, from the trunk outwards; ``known_sum`` is
+    the subject's `limb_length_sum`."""
     c = constants(template, p.device, p.dtype)
 
     # The origin of the completion is a seen hip or shoulder. Unseen joints are masked before any
@@ -208,11 +209,11 @@ def _filled(
     q = torch.where(is_seen, q - root, 0.0)
 
     # The size of the subject relative to the template.
-    if body_height is None:
+    if known_sum is None:
         scale = limb_length_sum(q, valid, template) / template.limb_length_sum
         scale = torch.where(scale.isnan(), 1.0, scale)
     else:
-        scale = torch.as_tensor(body_height, dtype=p.dtype, device=p.device)
+        scale = torch.as_tensor(known_sum, dtype=p.dtype, device=p.device)
         scale = (scale / template.limb_length_sum).expand(len(p))
 
     # Trunk and head. Joints that are placed later move none of their frames.

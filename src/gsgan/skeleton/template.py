@@ -129,6 +129,10 @@ class SkeletonTemplate:
             total += float(np.linalg.norm(rest[end] - rest[start]))
         return total
 
+    def stature_of(self, limb_length_sum: float) -> float:
+        """Metres: the stature of a subject whose limbs have this sum of lengths."""
+        return limb_length_sum * self.stature / self.limb_length_sum
+
     @property
     def rest_torso(self) -> Vector:
         """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsgan.data.datamodule import GsganData
+from gsgan.model.body_points import DENSE, points_per_pixel
 from gsgan.splat import resolve_backend
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.config import BFLOAT16_SINCE
@@ -103,7 +104,8 @@ def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
     rows = []
     on_body = module.avatar.body_points
     if on_body is not None:
-        apart = on_body.pixels_apart(data.info.scale_train[1])
+        scale = data.info.scale_train[1]
+        apart = on_body.pixels_apart(scale)
         number = f"{len(on_body.points):,} on the body"
         rows.append(
             (
@@ -111,6 +113,7 @@ def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
                 f"{number}, {apart:.1f} pixels apart in the training images",
             )
         )
+        rows += _advice(module, len(on_body.points), scale)
     if module.registered is not None:
         metres = module.registered.offsets.norm(dim=2).median()
         rows.append(
@@ -121,6 +124,22 @@ def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
             )
         )
     return rows
+
+
+def _advice(module: AvatarTraining, count: int, scale: float) -> list[Row]:
+    """Whether the model could do without its generator, as ``count`` Gaussians on the body are as
+    many as pixels in images of ``scale`` pixels per metre."""
+    per_pixel = points_per_pixel(count, module.avatar.stature, scale)
+    if module.avatar.generator is None or per_pixel < DENSE:
+        return []
+    return [
+        (
+            "advice",
+            f"{per_pixel:.2g} Gaussians per pixel of the person: from {DENSE:g} on, Step I's "
+            "colour scored as well as the final image, and model=splat_only trains it alone, in "
+            "less time (docs/ablations.md#who-needs-the-generator)",
+        )
+    ]
 
 
 def _losses(module: AvatarTraining, data: GsganData) -> list[Row]:

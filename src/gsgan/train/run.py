@@ -25,7 +25,7 @@ from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import trained, training_code
-from gsgan.evaluate.run import ScoreOptions, evaluate_method
+from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.page import refuse_unsuitable
 from gsgan.export.run import export_config
@@ -188,7 +188,8 @@ def run_training(config: DictConfig) -> None:
     # Scores and the web page.
     if trainer.is_global_zero:
         if options.scores is not None:
-            _evaluate(trainer, module, data, options, folder, console)
+            marks = [*module.marks, *choice_marks(config, data)]
+            _evaluate(trainer, module, data, options, folder, console, marks)
         if options.page:
             _write_page(folder, data)
         console.print(f"run folder: {folder}", soft_wrap=True)
@@ -386,8 +387,9 @@ def _evaluate(
     options: TrainOptions,
     folder: Path,
     console: Console,
+    marks: list[str],
 ) -> None:
-    """Scores the trained avatar on the held-out splits."""
+    """Scores the trained avatar on the held-out splits; ``marks`` accompany the scores."""
     device = trainer.strategy.root_device
 
     # Lightning leaves the module on the CPU.
@@ -413,7 +415,7 @@ def _evaluate(
         predict=painter(avatar),
         method=method,
         device=device,
-        marks=[*module.marks, *avatar.effects.marks],
+        marks=marks,
         poses=avatar.poses,
     )
 

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,13 @@ BFLOAT16_SINCE = 8, 0
 LONGEST_NAME = 200
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 ASSIGNED = re.compile(r"\+{0,2}[A-Za-z_][\w./@]*")  # the key of an override
+# Keys that there are no longer, and what takes their place.
+GONE = {
+    "effects.generator": "a model has the parts that its name says, and model=splat_only is the "
+    "one without a generator",
+    "effects.gaussians_per_pixel": "model.generator.refine=true or false chooses whether the "
+    "generator has a last level",
+}
 
 
 def config_folder() -> Path:
@@ -88,6 +95,13 @@ def refuse_words_for_truth(config: DictConfig, defaults: DictConfig) -> None:
         value = OmegaConf.select(config, key)
         if isinstance(default, bool) and not isinstance(value, bool):
             raise ConfigError(f"{key} must be true or false, got {value!r}")
+
+
+def refuse_gone(keys: Collection[str]) -> None:
+    """Raises a ConfigError if one of the keys of a config or a command line is in `GONE`."""
+    for key, instead in GONE.items():
+        if key in keys:
+            raise ConfigError(f"there is no {key} any more: {instead}")
 
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -196,6 +210,8 @@ def entry(
 
             keep_freed_memory()
             refuse_words_for_truth(config, defaults_of(name))
+            plain = OmegaConf.to_container(config, resolve=False)
+            refuse_gone(dict(flat(plain)))
             (get_method(task) if isinstance(task, str) else task)(config)
         except KeyboardInterrupt:
             _print_error("interrupted")
@@ -213,6 +229,14 @@ def entry(
 
     def main() -> None:
         import hydra  # here: importing an entry point stays fast
+
+        # Keys that Hydra would refuse without naming what takes their place.
+        given = [word.partition("=")[0].lstrip("+~") for word in sys.argv[1:]]
+        try:
+            refuse_gone(given)
+        except ConfigError as error:
+            _print_error(str(error))
+            sys.exit(FAILED)
 
         # Paths that Hydra's grammar cannot read as they are.
         sys.argv[1:] = map(quoted, sys.argv[1:])

@@ -15,6 +15,7 @@ from gsgan.weights.files import (
     read_convolutions,
     state_of_heads,
 )
+from gsgan.weights.parts import BackgroundMaps
 
 # The mean and deviation of ImageNet's channels, with which both networks were trained.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -52,11 +53,15 @@ class FeatureNetwork(nn.Module):
         """The maps ``[B, C, h, w]``, from the finest to the coarsest."""
         # Each stage continues from the map of the one before.
         maps = []
-        features = (image - self.mean) / self.std
+        features = self.normalised(image)
         for stage in self.stages:
             features = stage(features)
             maps.append(features)
         return maps
+
+    def normalised(self, image: Tensor) -> Tensor:
+        """Images with the mean and the deviation that the network was trained with."""
+        return (image - self.mean) / self.std
 
 
 def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
@@ -97,6 +102,18 @@ def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
     return FeatureNetwork(stages)
 
 
+def unit(features: Tensor) -> Tensor:
+    """Features ``[B, C, h, w]`` divided by their norm over the channels."""
+    norm = (features.square().sum(dim=1, keepdim=True) + EPSILON).sqrt()
+    return features / norm
+
+
+def mean_distance(layers: Sequence[Tensor]) -> Tensor:
+    """The distance ``[B]`` of two images, given its map in each layer."""
+    means = [layer.mean(dim=(1, 2, 3)) for layer in layers]
+    return torch.stack(means).sum(dim=0)
+
+
 class Lpips(nn.Module):
     """LPIPS 0.1: the distance of unit-length features, weighted by channel.
 
@@ -125,14 +142,23 @@ class Lpips(nn.Module):
             self.register_buffer(
                 f"head{layer}", state[f"lin{layer}.model.1.weight"]
             )
+        self._background: BackgroundMaps | None = None
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Unit-length features of images ``[B, 3, H, W]`` in [0, 1]."""
-        maps = []
-        for features in self.network(image):
-            norm = (features.square().sum(dim=1, keepdim=True) + EPSILON).sqrt()
-            maps.append(features / norm)
-        return maps
+        return list(map(unit, self.network(image)))
+
+    def background(self, image: Tensor) -> BackgroundMaps:
+        """The maps of a normalised image ``[1, 3, H, W]`` of the background alone, kept for later
+        calls."""
+        kept = self._background
+        if (
+            kept is None
+            or kept.image.device != image.device
+            or not torch.equal(kept.image, image)
+        ):
+            kept = self._background = BackgroundMaps(self.network.stages, image)
+        return kept
 
     def layers(
         self, features: Sequence[Tensor], others: Sequence[Tensor]
@@ -151,23 +177,7 @@ class Lpips(nn.Module):
         self, features: Sequence[Tensor], others: Sequence[Tensor]
     ) -> Tensor:
         """The distance ``[B]`` of two images, given their features."""
-        maps = self.layers(features, others)
-        return torch.stack([layer.mean(dim=(1, 2, 3)) for layer in maps]).sum(
-            dim=0
-        )
-
-    def distance_map(
-        self,
-        features: Sequence[Tensor],
-        others: Sequence[Tensor],
-        size: tuple[int, int],
-    ) -> Tensor:
-        """The distance of each pixel, ``[B, 1, H, W]``: the layers' maps, enlarged to ``size``."""
-        # The zero is a scalar, which broadcasts to the size of the maps.
-        total = features[0].new_zeros(())
-        for layer in self.layers(features, others):
-            total = total + functional.interpolate(layer, size, mode="bilinear")
-        return total
+        return mean_distance(self.layers(features, others))
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
         """The distance ``[B]`` of images ``[B, 3, H, W]`` in [0, 1]."""
