@@ -1,7 +1,7 @@
 """`gsgan.prepare`: videos in, a capture for `data=capture` out."""
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
+from gsgan.data.skeletons import usual_step
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
@@ -22,6 +23,7 @@ from gsgan.prepare.camera_array import (
     camera_moves,
     undistort_points,
 )
+from gsgan.prepare.clocks import DRIFT, by_time, renumbered, unsteady_clocks
 from gsgan.prepare.dataset import (
     Outcome,
     exists,
@@ -43,7 +45,7 @@ from gsgan.prepare.options import (
     read_inputs,
 )
 from gsgan.prepare.solve import Solution, median, solve
-from gsgan.prepare.sources import stamp
+from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
@@ -109,23 +111,30 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
             "file": inputs.calibration.path.name,
             "format": inputs.calibration.format,
         },
-        "notes": [*inputs.notes, *_late_clocks(solution, inputs.sources)],
+        "notes": [*inputs.notes, *_late_clocks(outcome)],
         "settings": outcome.options.record(),
     }
 
 
-def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
-    """Notes on cameras whose clocks are late."""
-    notes = []
+def _late_clocks(outcome: Outcome) -> list[str]:
+    """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
+    # Delays are counted in the chosen frames, of which only every n-th may be there.
+    solution = outcome.solution
+    step = usual_step(outcome.frames)
+    offsets = dict(outcome.options.offsets or {})
+    late = []
     for name, delay, gain in zip(
-        names, solution.delay, solution.gain, strict=True
+        outcome.inputs.sources, solution.delay, solution.gain, strict=True
     ):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
-            text = (
-                f"its clock seems {delay:+.1f} frames late; if so, set offsets="
-            )
-            notes.append(f"{name}: {text}{{{name}: {round(delay)}}}")
-    return notes
+            late.append(f"{name} {step * delay:+.1f}")
+            offsets[name] = offsets.get(name, 0) + round(step * delay)
+    if not late:
+        return []
+    text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
+    return [
+        f"clocks seem late, in frames: {', '.join(late)}; if so, set offsets={{{text}}}"
+    ]
 
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
@@ -187,7 +196,7 @@ def _number(value: float, form: str) -> str:
 
 
 # incremented when the same settings begin to give another result
-STAGE_VERSION = 6
+STAGE_VERSION = 7
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -228,11 +237,17 @@ def prepare(options: Options, console: Console) -> Path:
         solution = filmed.solution
         extra = {"one_camera": filmed.numbers}
         options = replace(options, face=False)
+        drift = np.zeros(1)
     else:
         # Several cameras: detections, then triangulation.
         found, masks = find_people(
             options, inputs.sources, stages, console.print
         )
+        inputs = _with_times(options, inputs, stages)
+        masks = {
+            name: renumbered(masks[name], source)
+            for name, source in inputs.sources.items()
+        }
         inputs, detections = with_detections(inputs, found)
         frames, uv, conf = _undistorted(options, inputs, detections)
         if options.calibration == PERSON:
@@ -240,6 +255,8 @@ def prepare(options: Options, console: Console) -> Path:
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
         solution = _solved(options, inputs, frames, uv, conf, console)
+        rig = CameraArray.of(inputs.cameras)
+        drift = unsteady_clocks(rig, uv[:, :, :BODY], conf[:, :, :BODY])
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
@@ -262,6 +279,7 @@ def prepare(options: Options, console: Console) -> Path:
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
     _refuse_errors(out)
+    _refuse_unsteady(out, inputs, drift)
     lines = (
         f"{out} is ready; look at {out / 'check.html'}, then",
         f"python -m gsgan.fit data=capture data.root={out}",
@@ -285,10 +303,52 @@ def with_detections(
     notes = [*inputs.notes]
     detections = {}
     for name in inputs.sources:
-        detections[name] = landmarks.read_detections(found[name])
-        for note in detections[name].notes:
+        read = landmarks.read_detections(found[name])
+        detections[name] = in_common(read, inputs.sources[name])
+        for note in read.notes:
             notes.append(f"{name}: {note}")
     return replace(inputs, notes=notes), detections
+
+
+def in_common(found: Detections, source: Recording) -> Detections:
+    """Detections by the frame numbers that all cameras share, in place of the source's own."""
+    rows = dict(enumerate(found.frame_id.tolist()))
+    by_number = renumbered(
+        {number: row for row, number in rows.items()}, source
+    )
+    numbers = np.array(sorted(by_number), np.int64)
+    at = [by_number[number] for number in numbers.tolist()]
+    return replace(
+        found, frame_id=numbers, px=found.px[at], conf=found.conf[at]
+    )
+
+
+def _with_times(
+    options: Options, inputs: Inputs, stages: StageFolder
+) -> Inputs:
+    """The inputs with frame numbers that stand for the same moments, by the videos' time stamps."""
+    timed = by_time(inputs.sources, stages, options.workers)
+    fps = inputs.fps
+    if timed.rate is not None and options.fps is None:
+        fps = timed.rate
+    return replace(
+        inputs,
+        sources=timed.sources,
+        fps=fps,
+        notes=[*inputs.notes, *timed.notes],
+    )
+
+
+def _refuse_unsteady(out: Path, inputs: Inputs, drift: Float) -> None:
+    """Raises a DataError if a camera's clock ``drift [C]`` shows that it lost frames."""
+    for name, frames in zip(inputs.sources, drift, strict=True):
+        if abs(frames) > DRIFT:
+            raise DataError(
+                f"{out} was written, but the clock of {name} is {frames:+.1f} frames later at the "
+                "end than at the beginning, against the other cameras: it lost frames without a "
+                "gap in its time stamps, or runs at another rate; give folders of images, numbered "
+                "alike in all cameras, or use the part before with frames="
+            )
 
 
 def _refuse_errors(out: Path) -> None:
