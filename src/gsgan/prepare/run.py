@@ -44,6 +44,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
+from gsgan.prepare.people import one_person
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -243,20 +244,20 @@ def prepare(options: Options, console: Console) -> Path:
         found, masks = find_people(
             options, inputs.sources, stages, console.print
         )
-        inputs = _with_times(options, inputs, stages)
-        masks = {
-            name: renumbered(masks[name], source)
-            for name, source in inputs.sources.items()
-        }
+        inputs, masks = _with_times(options, inputs, masks, stages)
         inputs, detections = with_detections(inputs, found)
+        inputs, detections = _with_one_person(options, inputs, detections)
         frames, uv, conf = _undistorted(options, inputs, detections)
         if options.calibration == PERSON:
             inputs = _from_person(options, inputs, uv, conf, console)
         if not inputs.calibration.metric:
             inputs = _in_metres(options, inputs, uv, conf)
         solution = _solved(options, inputs, frames, uv, conf, console)
-        rig = CameraArray.of(inputs.cameras)
-        drift = unsteady_clocks(rig, uv[:, :, :BODY], conf[:, :, :BODY])
+        drift = unsteady_clocks(
+            CameraArray.of(inputs.cameras),
+            uv[:, :, :BODY],
+            conf[:, :, :BODY],
+        )
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
@@ -318,25 +319,52 @@ def in_common(found: Detections, source: Recording) -> Detections:
     )
     numbers = np.array(sorted(by_number), np.int64)
     at = [by_number[number] for number in numbers.tolist()]
+    people = found.people
     return replace(
-        found, frame_id=numbers, px=found.px[at], conf=found.conf[at]
+        found,
+        frame_id=numbers,
+        px=found.px[at],
+        conf=found.conf[at],
+        people=None if people is None else [people[row] for row in at],
     )
 
 
+def _with_one_person(
+    options: Options, inputs: Inputs, detections: dict[str, Detections]
+) -> tuple[Inputs, dict[str, Detections]]:
+    """The inputs with a note on other people, and detections of one person."""
+    # Cameras that are yet to be found cannot tell people apart.
+    if options.calibration == PERSON:
+        return inputs, detections
+    chosen, notes = one_person(
+        detections, inputs.cameras, options.offsets or {}
+    )
+    return replace(inputs, notes=[*inputs.notes, *notes]), chosen
+
+
 def _with_times(
-    options: Options, inputs: Inputs, stages: StageFolder
-) -> Inputs:
-    """The inputs with frame numbers that stand for the same moments, by the videos' time stamps."""
+    options: Options,
+    inputs: Inputs,
+    masks: Mapping[str, Mapping[int, Path]],
+    stages: StageFolder,
+) -> tuple[Inputs, dict[str, dict[int, Path]]]:
+    """The inputs and masks with frame numbers that stand for the same moments, by the time stamps
+    of the videos."""
     timed = by_time(inputs.sources, stages, options.workers)
     fps = inputs.fps
     if timed.rate is not None and options.fps is None:
         fps = timed.rate
-    return replace(
+    in_time = replace(
         inputs,
         sources=timed.sources,
         fps=fps,
         notes=[*inputs.notes, *timed.notes],
     )
+    renamed = {
+        name: renumbered(masks[name], source)
+        for name, source in timed.sources.items()
+    }
+    return in_time, renamed
 
 
 def _refuse_unsteady(out: Path, inputs: Inputs, drift: Float) -> None:
@@ -389,7 +417,7 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
 
 
 def _undistorted(
-    options: Options, inputs: Inputs, detections: Mapping[str, Detections]
+    options: Options, inputs: Inputs, detections: dict[str, Detections]
 ) -> tuple[Ints, Float, Float]:
     """The chosen frames ``[F]``; undistorted pixels ``[C, F, J, 2]``, confidence ``[C, F, J]``."""
     # The chosen frames.

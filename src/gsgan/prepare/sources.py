@@ -282,6 +282,11 @@ def fit_size(
     """
     fitted = replace(camera, name=name, size=size)
     h, w = size
+    if camera.size == (0, 0) and camera.K[:2, 2].max() <= 1:
+        # An angle of view alone: lengths are shares of the width, the centre of each side.
+        K = camera.K * [[w], [w], [1]]
+        K[:2, 2] = camera.K[:2, 2] * (w, h)
+        return replace(fitted, K=K), None
     if camera.size == (0, 0):
         # Without a size, the principal point tells whether the images were larger.
         centre = camera.K[:2, 2]
