@@ -1,6 +1,7 @@
 """Of several people in view, the same one is taken in all cameras."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,10 @@ from capture_scenes import ring, seen
 from make import skeletons
 
 from gsgan.prepare.landmarks import Detections
+from gsgan.prepare.options import Inputs
 from gsgan.prepare.people import one_person
+from gsgan.prepare.run import with_detections
+from gsgan.prepare.sources import Recording
 from gsgan.skeleton.joints import ALL, BODY
 from gsgan.utils.errors import DataError
 
@@ -80,3 +84,14 @@ def test_people_that_cannot_be_joined_are_named_and_not_the_calibration():
         wrong.append(replace(camera, t=camera.t + np.array([0, metres, 0])))
     with pytest.raises(DataError, match="several people were detected in 12"):
         one_person(given, wrong, {})
+
+
+def test_several_faces_that_mediapipe_counts_are_noted(tmp_path):
+    arrays = {"px": np.full((4, 33, 2), 20.0), "conf": np.ones((4, 33))}
+    path = tmp_path / "a.npz"
+    np.savez(path, frame_id=np.arange(4), faces=[1, 2, 2, 1], **arrays)
+    video = Recording("a", Path("a.mp4"), (8, 8), 30.0, {}, 4)
+    inputs = Inputs({"a": video}, None, (), (), 30.0)
+    inputs, _ = with_detections(inputs, {"a": path})
+    (note,) = inputs.notes
+    assert "a: several people were detected in 2 of 4 frames" in note

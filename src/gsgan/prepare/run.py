@@ -35,7 +35,7 @@ from gsgan.prepare.from_person import calibrate_from_person
 from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import find_people, tool_key
-from gsgan.prepare.one_camera import solve_video
+from gsgan.prepare.one_camera import MAX_OTHER_FACES, solve_video
 from gsgan.prepare.one_view import USUAL_HEIGHT
 from gsgan.prepare.options import (
     MEDIAPIPE,
@@ -54,6 +54,7 @@ from gsgan.skeleton.joints import BODY, FACE, HANDS, known
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
+from gsgan.utils.pickles import read_arrays
 
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
@@ -308,6 +309,16 @@ def with_detections(
         detections[name] = in_common(read, inputs.sources[name])
         for note in read.notes:
             notes.append(f"{name}: {note}")
+
+        # MediaPipe follows one person, and counts the faces.
+        if found[name].is_file():
+            faces = read_arrays(found[name], ("faces",)).get("faces")
+            several = 0 if faces is None else int((faces > 1).sum())
+            if faces is not None and several > MAX_OTHER_FACES * len(faces):
+                notes.append(
+                    f"doubtful: {name}: several people were detected in {several} of {len(faces)} "
+                    "frames; give landmarks and masks of one person if they are mixed up"
+                )
     return replace(inputs, notes=notes), detections
 
 
