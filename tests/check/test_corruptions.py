@@ -63,9 +63,20 @@ ERRORS = {
         "[im]*/cam01/*", lambda image: image[:, ::-1]
     ),
     "camera cam03: its masks are empty": images("masks/cam03/*", np.zeros_like),
+    "all masks are empty .cam00, cam01": images("masks/*/*", np.zeros_like),
+    "masks are white everywhere": images(
+        "masks/*/*", lambda mask: np.full_like(mask, 255)
+    ),
+    "the inverted masks would fit": images(
+        "masks/*/*", lambda mask: 255 - mask
+    ),
 }
 WARNINGS = {
     "camera cam02 lacks 2 of the 12 frames: 3-4$": missing,
+    "masks have a second piece": images(
+        "masks/*/*",
+        lambda mask: np.maximum(mask, np.roll(mask, mask.shape[1] // 3, 1)),
+    ),
     ".*points along z, 90 degrees from the up axis y": lambda root: edit_json(
         root / "meta.json", lambda meta: meta.update(up_axis="y")
     ),
@@ -98,6 +109,41 @@ def test_a_truncated_image_is_found_though_few_are_sampled(copy, check):
     path.write_bytes(path.read_bytes()[:-30])
     report = check(copy, images=4)
     assert str(path) in only(report, "error")
+
+
+def test_all_damaged_and_missing_files_are_named_at_once(copy, check):
+    broken = [copy / f"masks/cam01/{frame:06d}.png" for frame in (2, 5)]
+    for path in broken:
+        path.write_bytes(b"no image")
+    (copy / "images/cam02/000004.png").unlink()
+    text = " ".join(f.sentence for f in check(copy).findings)
+    for path in broken:
+        assert text.count(str(path)) == 1
+    assert re.search(r"cam02 lacks 1 of 12 frames: 4", text)
+
+
+def test_masks_of_jpeg_are_read_with_128_as_the_limit(copy, check):
+    for path in (copy / "masks").glob("*/*.png"):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path.with_suffix(".jpg")), mask)
+        path.unlink()
+    assert check(copy).findings == ()
+
+
+def test_images_from_1_and_masks_from_0_are_a_warning(copy, check):
+    for path in sorted((copy / "images").glob("*/*"), reverse=True):
+        path.rename(path.with_name(f"{int(path.stem) + 1:06d}.png"))
+    text = " ".join(f.sentence for f in check(copy).findings)
+    assert "images are numbered from 1, masks from 0" in text
+    assert "images are numbered from 1, landmarks from 0" in text
+
+
+@pytest.mark.parametrize("name", ["{}_0.png", "frame{}_cam1.png"])
+def test_the_number_that_differs_counts_frames(copy, check, name):
+    for folder in ("images", "masks"):
+        for path in sorted((copy / folder).glob("*/*.png")):
+            path.rename(path.with_name(name.format(path.stem)))
+    assert check(copy).findings == ()
 
 
 def exchange(p):

@@ -15,6 +15,7 @@ from gsgan.data.validation import Thresholds
 from gsgan.prepare.landmarks import read_detections
 from gsgan.prepare.options import Inputs
 from gsgan.prepare.run import with_detections
+from gsgan.prepare.sources import Recording
 from gsgan.utils.errors import DataError
 from gsgan.utils.image_files import read_colour
 
@@ -218,7 +219,8 @@ def test_25_joints_without_hips_are_doubtful(tmp_path):
     assert "read as BODY_25, which cannot be told from BODY_25B" in note
 
     # The note is printed with those on the other inputs.
-    inputs = Inputs({"a": None, "b": None}, None, (), ["first"], 30.0)
+    video = Recording("a", Path("a.mp4"), (8, 8), 30.0, {}, 2)
+    inputs = Inputs({"a": video, "b": video}, None, (), ["first"], 30.0)
     inputs, detections = with_detections(inputs, {"a": told, "b": untold})
     assert inputs.notes == ["first", f"b: {note}"]
     assert list(detections) == ["a", "b"]

@@ -1,5 +1,6 @@
 """Exported Gaussians: what other programs read is what the avatar draws."""
 
+import gzip
 import io
 
 import numpy as np
@@ -14,7 +15,9 @@ from gsgan.export.splats import (
     glb_bytes,
     in_world,
     ply_bytes,
+    splat_bytes,
     splats_of,
+    spz_bytes,
 )
 from gsgan.scene import Gaussians
 from gsgan.splat import rasterise, sh_to_colour
@@ -201,3 +204,67 @@ def test_a_glb_holds_the_same_gaussians(posed):
     )
     up = Rotation.from_quat(gltf.nodes[0].rotation).apply([0, -1, 0])
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-9)
+
+
+def some_splats(count: int = 5) -> Splats:
+    rng = np.random.default_rng(0)
+    quats = Rotation.random(count, random_state=0).as_quat()
+    return Splats(
+        means=rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        scales=rng.uniform(0.005, 0.02, (count, 3)).astype(np.float32),
+        quats=np.roll(quats, 1, axis=1).astype(np.float32),
+        opacities=rng.uniform(0.2, 1, count).astype(np.float32),
+        sh=rng.uniform(-0.5, 0.5, (count, 4, 3)).astype(np.float32),
+    )
+
+
+def test_splat_files_hold_bytes_of_the_values():
+    splats = some_splats()
+    raw = np.frombuffer(splat_bytes(splats), np.uint8).reshape(-1, 32)
+    means = raw[:, :12].copy().view("<f4")
+    order = [int(np.abs(splats.means - mean).sum(1).argmin()) for mean in means]
+    assert sorted(order) == list(range(5))
+    np.testing.assert_array_equal(means, splats.means[order])
+    np.testing.assert_array_equal(
+        raw[:, 12:24].copy().view("<f4"), splats.scales[order]
+    )
+    colour = 0.5 + 0.28209479 * splats.sh[order, 0]
+    np.testing.assert_allclose(raw[:, 24:27] / 255, colour, atol=0.003)
+    np.testing.assert_allclose(
+        raw[:, 27] / 255, splats.opacities[order], atol=0.003
+    )
+    np.testing.assert_allclose(
+        (raw[:, 28:] - 128.0) / 128, splats.quats[order], atol=0.006
+    )
+
+
+def test_spz_files_hold_quantised_columns_with_y_up():
+    splats = some_splats()
+    raw = np.frombuffer(gzip.decompress(spz_bytes(splats, "z")), np.uint8)
+    assert bytes(raw[:4]) == b"NGSP"
+    assert raw[4:16].tolist() == [2, 0, 0, 0, 5, 0, 0, 0, 1, 12, 0, 0]
+    body = raw[16:]
+    assert len(body) == 5 * (9 + 1 + 3 + 3 + 3 + 9)
+    fixed = np.zeros((15, 4), np.uint8)
+    fixed[:, :3] = body[:45].reshape(-1, 3)
+    fixed[:, 3] = np.where(fixed[:, 2] > 127, 255, 0)
+    means = fixed.view("<i4").reshape(5, 3) / 4096
+    x, y, z = splats.means.T
+    np.testing.assert_allclose(means, np.c_[x, z, -y], atol=2e-4)
+    np.testing.assert_allclose(body[45:50] / 255, splats.opacities, atol=0.003)
+    dc = (body[50:65].reshape(5, 3) / 255 - 0.5) / 0.15
+    np.testing.assert_allclose(dc, splats.sh[:, 0], atol=0.02)
+    scales = np.exp(body[65:80].reshape(5, 3) / 16 - 10)
+    np.testing.assert_allclose(scales, splats.scales, rtol=0.04)
+
+    # The turned Gaussians have turned harmonics: colours of turned directions are the same.
+    vector = body[80:95].reshape(5, 3) / 127.5 - 1
+    real = np.sqrt(np.clip(1 - (vector**2).sum(1), 0, 1))
+    turn = Rotation.from_matrix([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    truth = turn * Rotation.from_quat(np.roll(splats.quats, -1, axis=1))
+    off = truth.inv() * Rotation.from_quat(np.c_[vector, real])
+    assert np.degrees(off.magnitude()).max() < 6
+    rest = (body[95:].reshape(5, 3, 3) - 128.0) / 128
+    before = splats.sh[:, 1:]  # of y, z, x with signs - + -
+    expected = np.stack([-before[:, 1], -before[:, 0], before[:, 2]], axis=1)
+    assert np.abs(np.abs(rest) - np.abs(expected)).max() < 0.05

@@ -21,7 +21,7 @@ from gsgan.motion.retarget import retargeted
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.proportions import BONES, measure_proportions, upright
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"
 # Landmarks and the joints of the SMPL family that lie there.
@@ -829,3 +829,110 @@ def test_rotations_of_smpl_in_other_forms(tmp_path, shared, proportions):
         np.savez(path, poses=poses, **moves)
         with pytest.raises(DataError, match=r"a\.npz.*rotation vectors"):
             read_motion(path, Source(proportions, model))
+
+
+# ------------------------------------------------ SMPL's relatives
+
+
+def smpl_h(path: Path, arrays: dict) -> None:
+    """A model of SMPL-H: the arrays of SMPL, with fifteen joints for each hand."""
+    body = arrays["kintree_table"][0, :22]
+    parents = [*body, *[20] * 15, *[21] * 15]
+    weights = np.zeros((6890, 52))
+    weights[:, :22] = arrays["weights"][:, :22]
+    weights[:, 30] = arrays["weights"][:, 22]
+    weights[:, 40] = arrays["weights"][:, 23]
+    regressor = arrays["J_regressor"]
+    hands = [regressor[[22]].repeat(15, 0), regressor[[23]].repeat(15, 0)]
+    new = {
+        "kintree_table": np.array([parents, range(52)]),
+        "weights": weights,
+        "J_regressor": np.concatenate([regressor[:22], *hands]),
+        "posedirs": np.zeros((6890, 3, 9 * 51)),
+    }
+    np.savez(path, **{**arrays, **new})
+
+
+def test_relatives_of_smpl_are_the_same_motion(tmp_path, shared, proportions):
+    from writers.smpl import smpl_arrays, write_smpl
+
+    model = shared("smpl.pkl", lambda path: write_smpl(path, kind="smpl"))
+    poses = np.zeros((5, 72))
+    poses[:, 3 * 18 + 2] = 1.5  # the left elbow
+    poses[:, 1] = np.arange(5) / 10
+    move = np.zeros((5, 3))
+    arrays = {"poses": poses, "trans": move, "betas": np.zeros(10)}
+    np.savez(tmp_path / "smpl.npz", **arrays)
+    truth, _ = standard(tmp_path / "smpl.npz", proportions, smpl=model)
+
+    # Meshcapade's file, SLAHMR's with two people, GVHMR's as a pickle.
+    body = poses[:, :66].reshape(5, 22, 3)
+    with (tmp_path / "a.smpl").open("wb") as file:
+        np.savez(
+            file,
+            bodyPose=body,
+            bodyTranslation=move,
+            shapeParameters=np.zeros(10),
+            frameRate=30.0,
+        )
+    np.savez(
+        tmp_path / "slahmr.npz",
+        pose_body=np.stack([poses[:, 3:66]] * 2),
+        root_orient=np.stack([poses[:, :3]] * 2),
+        trans=np.stack([move] * 2),
+        betas=np.zeros((2, 10)),
+    )
+    parameters = {
+        "body_pose": poses[:, 3:66],
+        "global_orient": poses[:, :3],
+        "transl": move,
+    }
+    (tmp_path / "gvhmr.pkl").write_bytes(
+        pickle.dumps({"smpl_params_global": parameters})
+    )
+
+    # EasyMocap's folder of fits: the root's rotation is apart, and poses have it too, empty.
+    fits = tmp_path / "fits"
+    fits.mkdir()
+    for frame, row in enumerate(poses):
+        fit = {
+            "id": 0,
+            "Rh": [row[:3].tolist()],
+            "Th": [[0, 0, 0]],
+            "poses": [[0, 0, 0, *row[3:].tolist()]],
+            "shapes": [[0] * 10],
+        }
+        (fits / f"{frame:06d}.json").write_text(json.dumps([fit]))
+    for name in ("a.smpl", "slahmr.npz", "gvhmr.pkl", "fits"):
+        found, _ = standard(tmp_path / name, proportions, smpl=model)
+        np.testing.assert_allclose(
+            directions(found), directions(truth), atol=1e-6, err_msg=name
+        )
+
+    # AMASS' 52 joints with SMPL-H's model.
+    smpl_h(tmp_path / "SMPLH.npz", smpl_arrays("smpl"))
+    wide = np.zeros((5, 156))
+    wide[:, :66] = poses[:, :66]
+    np.savez(tmp_path / "amass.npz", **{**arrays, "poses": wide})
+    found, _ = standard(
+        tmp_path / "amass.npz", proportions, smpl=tmp_path / "SMPLH.npz"
+    )
+    np.testing.assert_allclose(directions(found), directions(truth), atol=1e-6)
+    with pytest.raises(ConfigError, match="is a folder; give the file in it"):
+        standard(tmp_path / "amass.npz", proportions, smpl=tmp_path)
+
+
+def test_bare_lists_of_shares_of_an_image_are_refused(tmp_path, proportions):
+    points = np.random.default_rng(0).uniform(0.2, 0.9, (4, 33, 3))
+    path = tmp_path / "image.json"
+    path.write_text(json.dumps(points.tolist()))
+    with pytest.raises(DataError, match="not its image landmarks"):
+        standard(path, proportions)
+
+
+def test_markers_with_names_in_latin_1_are_read(tmp_path, proportions):
+    path = tmp_path / "a.trc"
+    path.write_bytes("PathFileType\t4\tübung.trc\n".encode("latin-1"))
+    with pytest.raises(DataError) as caught:
+        standard(path, proportions)
+    assert "codec" not in str(caught.value)

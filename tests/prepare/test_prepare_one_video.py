@@ -19,15 +19,14 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.frames import look, sample
 from gsgan.prepare.mediapipe import SCRIPT
 from gsgan.prepare.one_camera import (
-    FOCAL_KEY,
     Detected,
     doubtful_poses,
-    read_metadata,
     with_right_sides,
 )
 from gsgan.prepare.one_view import Seen, solve_view
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
+from gsgan.prepare.sources import FOCAL_KEY, read_metadata
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.joints import ALL, BODY, HANDS, LEFT, WRIST_JOINTS

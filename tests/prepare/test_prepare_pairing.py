@@ -6,7 +6,15 @@ from pathlib import Path
 import pytest
 from capture_scenes import ring
 
-from gsgan.prepare.sources import fit_size, pair_cameras
+from gsgan.prepare.sources import (
+    Metadata,
+    Recording,
+    find_sources,
+    fit_size,
+    pair_cameras,
+    recording_notes,
+    upright,
+)
 from gsgan.utils.errors import DataError
 
 
@@ -59,3 +67,34 @@ def test_a_calibration_without_a_size_tells_another_resolution_by_its_centre():
 def test_another_resolution_is_refused():
     with pytest.raises(DataError, match="1080x1920"):
         fit_size(ring()[0], "left", (960, 540), 16, Path("rig"))
+
+
+def recording(turned: int = 0) -> Recording:
+    return Recording("a", Path("a.mp4"), (96, 128), 30.0, {}, 40, turned)
+
+
+def test_a_rotation_is_applied_where_it_alone_makes_the_sizes_agree():
+    turned, note = upright(recording(90), (128, 96))
+    assert (turned.size, turned.rotate) == ((128, 96), True)
+    assert "90 degrees" in note
+    assert "apply_rotation=true" in note
+    for other in (recording(90), recording(180)):
+        assert upright(other, (96, 128)) == (other, None)
+    assert upright(recording(0), (128, 96)) == (recording(0), None)
+
+
+def test_hdr_colours_are_named_with_several_cameras(monkeypatch):
+    hdr = Metadata(hdr="HLG")
+    monkeypatch.setattr("gsgan.prepare.sources.read_metadata", lambda _: hdr)
+    (note,) = recording_notes({"a": recording()})
+    assert "a: its colours are HDR (HLG)" in note
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [(b"", r"a\.mp4 is empty"), (b"\0" * 900, r"a\.mp4 cannot.*copy it again")],
+)
+def test_empty_and_cut_off_videos_are_named(tmp_path, content, what):
+    (tmp_path / "a.mp4").write_bytes(content)
+    with pytest.raises(DataError, match=what):
+        find_sources(tmp_path)

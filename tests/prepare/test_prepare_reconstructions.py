@@ -17,6 +17,7 @@ from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.reconstructions import CAMERA_MODELS
 from gsgan.prepare.run import prepare
+from gsgan.prepare.sources import fit_size
 from gsgan.utils.errors import DataError
 
 # The parameters of a camera in the order of each model.
@@ -329,3 +330,101 @@ def test_the_persons_height_gives_the_scale_and_the_up_axis(tmp_path):
     q = np.load(kept / "landmarks3d.npz")["p"]
     difference = np.abs(distances(q) / unit - distances(truth))
     assert np.nanmax(difference) < 0.05
+
+
+# ------------------------------------------------ names of images
+
+
+def scene_of(folder: Path, names: str, moments: int = 2) -> Path:
+    """transforms.json of three cameras whose images are named by camera and moment."""
+    frames = []
+    for moment in range(moments):
+        for camera in ring()[:3]:
+            pose = np.eye(4)
+            pose[:3, :3] = camera.R.T @ np.diag([1, -1, -1])
+            pose[:3, 3] = camera.centre
+            name = names.format(camera=camera.name, moment=f"{moment:06d}")
+            frames.append(
+                {"file_path": name, "transform_matrix": pose.tolist()}
+            )
+    content = {"w": 1080, "h": 1920, "fl_x": 1000.0, "frames": frames}
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "images\\{camera}\\{moment}.png",
+        "{camera}/rgb/{moment}.png",
+        "rig/{camera}/images/{moment}.jpg",
+        "{moment}/{camera}.jpg",
+        "{moment}/{camera}/image.jpg",
+        "{camera}/{moment}.png",
+    ],
+)
+def test_the_part_of_the_path_that_differs_names_the_camera(tmp_path, names):
+    cameras = read_calibration(scene_of(tmp_path, names)).cameras
+    assert sorted(cameras) == ["cam0", "cam1", "cam2"]
+
+
+def test_an_angle_of_view_alone_has_the_size_of_the_images(tmp_path):
+    path = scene_of(tmp_path, "images/{camera}", moments=1)
+    content = json.loads(path.read_text())
+    for key in ("w", "h", "fl_x"):
+        del content[key]
+    content["camera_angle_x"] = float(2 * np.arctan(540 / 1000))
+    path.write_text(json.dumps(content))
+    camera = read_calibration(path).cameras["cam0"]
+    fitted, note = fit_size(camera, "cam0", (1920, 1080), 16, path)
+    np.testing.assert_allclose(
+        fitted.K, [[1000, 0, 540], [0, 1000, 960], [0, 0, 1]]
+    )
+    assert note is None
+
+
+def test_images_txt_without_lines_of_points(tmp_path):
+    path = write_colmap(tmp_path, ring(), "PINHOLE", binary=False)
+    images = tmp_path / "images.txt"
+    lines = images.read_text().splitlines()
+    kept = [line for line in lines if line.startswith("#") or ".jpg" in line]
+    images.write_text("\n".join(kept))
+    assert len(read_calibration(path).cameras) == 4
+
+
+@pytest.mark.parametrize("panoptic", [True, False])
+def test_the_json_of_panoptic_and_thuman(tmp_path, panoptic):
+    cameras = ring(dist=LENS)
+    entries = {}
+    for camera in cameras:
+        h, w = camera.size
+        K = camera.K.copy()
+        K[:2, 2] -= 0.5
+        if panoptic:
+            entries[camera.name] = {
+                "name": camera.name,
+                "resolution": [w, h],
+                "K": K.tolist(),
+                "distCoef": camera.dist[:5].tolist(),
+                "R": camera.R.tolist(),
+                "t": (100 * camera.t[:, None]).tolist(),
+            }
+        else:
+            entries[camera.name] = {
+                "imgSize": [w, h],
+                "K": K.ravel().tolist(),
+                "distCoeff": camera.dist[:5].tolist(),
+                "R": camera.R.ravel().tolist(),
+                "T": camera.t.tolist(),
+            }
+    content = {"cameras": list(entries.values())} if panoptic else entries
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(content))
+    found = read_calibration(path)
+    assert found.metric
+    for camera in cameras:
+        read = found.cameras[camera.name]
+        for key in ("K", "R", "t", "dist"):
+            np.testing.assert_allclose(getattr(read, key), getattr(camera, key))
+        assert read.size == camera.size

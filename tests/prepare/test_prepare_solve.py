@@ -16,7 +16,6 @@ from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.solve import (
     SolveSettings,
-    clock_errors,
     correct,
     median,
     refine,
@@ -188,19 +187,6 @@ def test_cleansing_removes_impossible_joints():
     assert np.isnan(found[6, 27]).all()
     assert removed == {"too far away": 1, "bone length": 1}
     assert np.isfinite(found).sum() == np.isfinite(p).sum() - 6
-
-
-def test_a_late_clock_is_measured():
-    cameras = ring()
-    rig, _, uv, conf = seen(cameras, frames=40)
-    late = uv.copy()
-    late[1, 2:] = uv[1, :-2]  # shows at frame f what the others show at f - 2
-    delay, gain = clock_errors(rig, late, conf)
-    assert delay[1] == pytest.approx(-2, abs=0.2)
-    assert gain[1] > 0.5
-    delay, gain = clock_errors(rig, uv, conf)
-    np.testing.assert_allclose(delay, 0, atol=0.05)
-    assert np.isnan(clock_errors(rig[2:], uv[2:], conf[2:])[0]).all()
 
 
 def test_all_stages_together_end_near_the_truth():

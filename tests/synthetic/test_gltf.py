@@ -1,5 +1,6 @@
 """Rigged .glb files read as characters: geometry, bones, textures, labels, landmarks, errors."""
 
+import base64
 import re
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from gsgan.body.free import free_body
 from gsgan.motion.humanoid import mixamo_bone, vrm_bone
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
+from gsgan.synthetic.textures import srgb
 from gsgan.utils.errors import DataError
 
 VALID = Path(__file__).resolve().parents[3] / "shared" / "data" / "valid"
@@ -165,6 +167,102 @@ def test_textures_factors_and_coverage(tmp_path):
     np.testing.assert_allclose(masked.colour[0, 0], [132, 180, 180, 50], atol=1)
 
 
+def test_a_texture_transform_is_applied_to_the_coordinates(tmp_path):
+    glb = TinyGlb()
+    shader = glb.doc.materials[0].pbrMetallicRoughness
+    shader.baseColorTexture.extensions = {
+        "KHR_texture_transform": {
+            "offset": [0.1, 0.2],
+            "scale": [2, 3],
+            "rotation": np.pi / 2,
+        }
+    }
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    # (0.25, 0.25) scaled, turned by a quarter, moved
+    np.testing.assert_allclose(character.uv[0], [0.1 + 0.75, 0.2 - 0.5])
+
+
+def test_colours_of_vertices_are_a_texture(tmp_path, tiny):
+    glb = TinyGlb()
+    glb.doc.materials[0].pbrMetallicRoughness.baseColorTexture = None
+    colours = coloured(glb)
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(
+        character.vertices[character.faces], tiny.vertices[tiny.faces]
+    )
+    image = character.surfaces[0].colour
+    column, row = np.floor(character.uv * len(image)).astype(int).T
+    expected = srgb(colours.astype(float))[tiny.faces.ravel()]
+    np.testing.assert_allclose(
+        image[row, column, :3] / 255, expected, atol=0.003
+    )
+
+
+def test_a_texture_without_an_image_is_white(tmp_path):
+    glb = TinyGlb()
+    glb.doc.textures = [pygltflib.Texture()]
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    assert (character.surfaces[0].colour[..., :3] == 255).all()
+
+
+def test_an_image_in_a_data_uri_and_glossy_materials_are_read(tmp_path, tiny):
+    glb = TinyGlb()
+    view = glb.doc.bufferViews[glb.doc.images[0].bufferView]
+    data = glb.blob[view.byteOffset : view.byteOffset + view.byteLength]
+    text = base64.b64encode(bytes(data)).decode()
+    glb.doc.images[0] = pygltflib.Image(uri=f"data:image/png;base64,{text}")
+    glb.doc.materials[0].pbrMetallicRoughness = None
+    glb.doc.materials[0].extensions = {
+        "KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}
+    }
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(
+        character.surfaces[0].colour, tiny.surfaces[0].colour
+    )
+
+
+@pytest.mark.parametrize("turn", [[0.7071068, 0, 0, 0.7071068], [0, 0, 1, 0]])
+def test_a_person_who_lies_is_stood_up(tmp_path, turn, tiny):
+    glb = TinyGlb()
+    root = pygltflib.Node(name="Armature", rotation=turn, children=[0])
+    glb.doc.nodes.append(root)
+    other = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(other.vertices, tiny.vertices, atol=1e-5)
+
+
+RIGIFY = {
+    "Hips": "DEF-spine",
+    "Spine": "DEF-spine.001",
+    "Neck": "DEF-spine.004",
+    "Head": "DEF-spine.006",
+}
+BIPED = {
+    "Hips": "Bip01 Pelvis",
+    "Spine": "Bip01 Spine",
+    "Neck": "Bip01 Neck",
+    "Head": "Bip01 Head",
+}
+for _side in ("Left", "Right"):
+    for _bone, _rigify, _biped in (
+        ("Arm", "upper_arm", "UpperArm"),
+        ("ForeArm", "forearm", "Forearm"),
+        ("Hand", "hand", "Hand"),
+        ("UpLeg", "thigh", "Thigh"),
+        ("Leg", "shin", "Calf"),
+        ("Foot", "foot", "Foot"),
+    ):
+        RIGIFY[_side + _bone] = f"DEF-{_rigify}.{_side[0]}"
+        BIPED[_side + _bone] = f"Bip01 {_side[0]} {_biped}"
+SKETCHFAB = {bone: f"mixamorig:{bone}_0{k}" for k, bone in enumerate(BONES)}
+
+
+@pytest.mark.parametrize("names", [RIGIFY, BIPED, SKETCHFAB])
+def test_names_of_motions_are_those_of_characters(tmp_path, names, tiny):
+    character = read_character(TinyGlb(names=names).write(tmp_path / "a.glb"))
+    assert set(character.bones) == set(BONES)
+    np.testing.assert_allclose(character.vertices, tiny.vertices, atol=1e-6)
+
+
 @pytest.mark.parametrize("version", [0, 1])
 def test_vrm_maps_bones(tmp_path, version, tiny):
     names = {bone: f"J_{k}" for k, bone in enumerate(BONES)}
@@ -244,6 +342,18 @@ def a_nan(glb: TinyGlb) -> None:
     glb.blob[start : start + 4] = np.float32("nan").tobytes()
 
 
+BASISU = pygltflib.Texture(extensions={"KHR_texture_basisu": {"source": 0}})
+
+
+def coloured(glb: TinyGlb) -> np.ndarray:
+    """Gives the vertices colours, which it returns."""
+    attributes = glb.doc.meshes[0].primitives[0].attributes
+    count = glb.doc.accessors[attributes.POSITION].count
+    colours = np.random.default_rng(0).random((count, 3)).astype("f4")
+    attributes.COLOR_0 = glb.accessor(colours, "VEC3")
+    return colours
+
+
 LEFT_HAND = list(BONES).index("LeftHand")
 BAD = {
     "no skin": no_skin,
@@ -253,9 +363,16 @@ BAD = {
     "no triangles": lambda glb: setattr(
         glb.doc.meshes[0].primitives[0], "mode", 1
     ),
-    "separate file": lambda glb: glb.doc.images.__setitem__(
-        0, pygltflib.Image(uri="skin.png")
+    "image skin.png is not in the same folder": lambda glb: (
+        glb.doc.images.__setitem__(0, pygltflib.Image(uri="skin.png"))
     ),
+    "NEW_thing is not supported": lambda glb: glb.doc.extensionsRequired.append(
+        "NEW_thing"
+    ),
+    "KHR_texture_basisu is not supported": lambda glb: setattr(
+        glb.doc, "textures", [BASISU]
+    ),
+    "bake the colours into the texture": lambda glb: coloured(glb),
     "draco": lambda glb: glb.doc.extensionsRequired.append(
         "KHR_draco_mesh_compression"
     ),

@@ -1,9 +1,18 @@
 """Paths as users type them reach a command as they are."""
 
+import re
+from itertools import pairwise
+
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.utils.config import quoted
+from gsgan.utils.config import (
+    DATA_PATHS,
+    PATHS,
+    config_folder,
+    paths_as_text,
+    quoted,
+)
 
 ODD = (
     "walk cycle (1).bvh",
@@ -17,6 +26,26 @@ ODD = (
     "50%.bvh",
     "dance(1)",
     "plain/path.bvh",
+    "20261129",
+    "1.5",
+    "1e3",
+    "true",
+    "walk,slow.bvh",
+    "C:\\takes\\",
+    "it's \\'odd\\'",
+    "{camera}_{frame}.png",
+)
+
+
+# Keys whose comments name files though they are none.
+TEXT = (
+    "frames",
+    "motion_fps",
+    "figures",
+    "up",
+    "animation",
+    "unit",
+    "camera_unit",
 )
 
 
@@ -27,11 +56,50 @@ def parsed(argument: str) -> object:
 
 
 @pytest.mark.parametrize("path", ODD)
-@pytest.mark.parametrize(
-    "key", ["motion", "data.root", "+on.root", "hydra.run.dir"]
-)
+@pytest.mark.parametrize("key", sorted(PATHS))
 def test_odd_paths_arrive_as_typed(key, path):
+    if key == "other_capture" and path.startswith("{"):
+        return  # keys of a dataset
     assert str(parsed(f"{key}={path}")) == path
+    assert type(parsed(f"{key}={path}")) is not int
+
+
+def test_a_list_of_odd_paths_arrives_as_typed():
+    paths = [path for path in ODD if "," not in path and "'" not in path]
+    found = parsed(f"motion=[{', '.join(paths)},'with,comma']")
+    assert [str(path) for path in found] == [*paths, "with,comma"]
+
+
+def test_commas_part_the_values_of_a_sweep():
+    assert quoted("run=377,378", sweep=True) == "run=377,378"
+    assert quoted("run=377", sweep=True) == "run='377'"
+
+
+def test_numbers_of_config_files_become_text():
+    config = OmegaConf.create({"data": {"root": 377}, "runs": [1, "b"]})
+    paths_as_text(config)
+    assert config == {"data": {"root": "377"}, "runs": ["1", "b"]}
+
+
+def test_every_key_that_the_config_folder_calls_a_path_is_one():
+    words = re.compile(r"\b(file|folder|capture)s?\b")
+    for file in config_folder().glob("*.yaml"):
+        for above, line in pairwise(["", *file.read_text().splitlines()]):
+            key, sign, rest = line.partition(": ")
+            own, _, comment = rest.partition("#")
+            if not sign or not key.isidentifier() or own.strip() != "null":
+                continue
+            said = comment or (above if above.startswith("#") else "")
+            if words.search(said.split(";")[0]) and key not in TEXT:
+                assert key in PATHS, f"{file.name}: {key}"
+
+
+def test_the_keys_of_datasets_exist():
+    held = "".join(
+        path.read_text() for path in config_folder().glob("data/*.yaml")
+    )
+    for key in DATA_PATHS:
+        assert f"{key.rpartition('.')[2]}:" in held
 
 
 def test_the_users_folder_is_expanded(monkeypatch):

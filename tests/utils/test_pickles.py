@@ -5,6 +5,7 @@ import os
 import pickle
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -305,3 +306,19 @@ def test_damage_is_read_or_refused_and_nothing_else(tmp_path, kind):
             sentences.append(str(error))
     assert len(sentences) > 25
     assert all("file.pkl" in s and "\n" not in s for s in sentences)
+
+
+@pytest.mark.parametrize("squeezed", [False, True])
+@pytest.mark.parametrize(
+    ("key", "line"), [(b"global_orient", "'smpl'"), (b"pose", "[0]")]
+)
+def test_files_of_joblib_are_named_with_the_line_that_converts_them(
+    tmp_path, squeezed, key, line
+):
+    content = b"\x80\x04}\x94\x8c" + key + b"\x8c\x13joblib.numpy_pickle\x94"
+    path = tmp_path / "wham.pkl"
+    path.write_bytes(zlib.compress(content) if squeezed else content)
+    with pytest.raises(DataError, match="written by joblib") as caught:
+        read_pickle(path)
+    assert line in str(caught.value)
+    assert "savez('wham.npz'" in str(caught.value)

@@ -42,6 +42,29 @@ def test_other_pages_are_refused(host, origin):
     assert refusal(host, origin, "127.0.0.1")
 
 
+def test_a_refusal_names_the_option_that_allows_it():
+    why = refusal("studio.lan:8080", None, "0.0.0.0")
+    assert "host=studio.lan" in why
+    why = refusal("localhost:8080", "https://name", "127.0.0.1")
+    assert "origin=" in why
+    why = refusal("localhost:8080", None, "127.0.0.1", None, "name, inner")
+    assert "origin=https://name" in why
+    assert "evil" not in refusal(HOST, None, "127.0.0.1", None, "<b>evil</b>")
+
+
+@pytest.mark.parametrize(
+    ("host", "forwarded"),
+    [("localhost:8080", "name"), ("localhost:8080", None), ("name", None)],
+)
+def test_the_named_origin_may_connect(host, forwarded):
+    for origin in ("https://name", None):
+        assert (
+            refusal(host, origin, "127.0.0.1", "https://name/", forwarded)
+            is None
+        )
+    assert refusal(host, "https://other", "127.0.0.1", "https://name")
+
+
 def test_visers_server_refuses_them():
     viser = pytest.importorskip(
         "viser", reason="the extra view is not installed"

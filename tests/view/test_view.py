@@ -11,6 +11,8 @@ import pytest
 import torch
 from commands import refused
 
+from gsgan.utils.errors import ConfigError
+
 viser = pytest.importorskip("viser", reason="the extra view is not installed")
 PATIENCE = 60.0  # seconds
 
@@ -235,6 +237,26 @@ def test_it_listens_on_this_machine_alone(viewer, compose):
     assert compose("view").host == "127.0.0.1"
     assert viewer.server.get_host() == "127.0.0.1"
     assert viewer.server.request_share_url() is None  # no public address
+
+
+def test_all_addresses_of_the_machine_are_printed(viewer, monkeypatch):
+    port = viewer.server.get_port()
+    assert viewer.addresses == [f"http://127.0.0.1:{port}"]
+    monkeypatch.setattr(viewer.server, "get_host", lambda: "0.0.0.0")
+    monkeypatch.setattr(
+        "gsgan.view.server.network_addresses", lambda: ["192.0.2.7"]
+    )
+    assert viewer.addresses == [
+        f"http://192.0.2.7:{port}",
+        f"http://localhost:{port}",
+    ]
+
+
+def test_an_origin_that_is_no_address_is_refused(bare, compose):
+    from gsgan.view.server import Viewer
+
+    with pytest.raises(ConfigError, match="origin must be"):
+        Viewer(compose("view", f"run={bare}", "origin=name", "motion=rest"))
 
 
 def test_an_ipv6_address(bare, compose):

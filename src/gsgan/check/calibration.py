@@ -20,6 +20,10 @@ from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED_IMAGES = "mirrored images"
+FULL = 0.98  # share of the image above which a mask is white everywhere
+# Area of another piece of the mask over the person's, and share of a camera's images with one.
+OTHER_PIECE = 0.3
+OTHER_IMAGES = 0.1
 # Maximum number of images per camera on which calibrations are tried.
 TRIED = 8
 # The right calibration has 0.6 to 0.7, with slim masks 0.4.
@@ -50,6 +54,9 @@ class CameraScore:
     # `MIRRORED_IMAGES`.
     rivals: dict[str, float]
     outside: float  # metres, mean distance of the joints from the mask
+    inverted: float  # mean overlap of the inverted masks with the estimated silhouette
+    filled: float  # median share of the image that the masks fill
+    others: float  # share of images in which another piece of the mask is large
 
     @property
     def best_rival(self) -> float:
@@ -99,6 +106,9 @@ def score_cameras(
             )
         best_first = sorted(rivals.items(), key=lambda rival: -rival[1])
 
+        # The same masks with the person in black.
+        inverted = [replace(v, mask=~v.mask & v.shown) for v in chosen]
+
         # Empty masks tell nothing about joints.
         inside = []
         outside = []
@@ -117,6 +127,11 @@ def score_cameras(
                 fullness=float(np.median(fullness)),
                 rivals=dict(best_first),
                 outside=known_mean(outside),
+                inverted=_fit(subject, inverted, camera),
+                filled=float(np.median([view.filled for view in own])),
+                others=float(
+                    np.mean([v.other_piece > OTHER_PIECE for v in own])
+                ),
             )
         )
     return scores
@@ -231,6 +246,52 @@ def calibration_findings(
         else:
             fine.append(score)
     return found + small_errors(fine, limits)
+
+
+def mask_findings(
+    scores: Sequence[CameraScore], limits: Limits
+) -> list[Finding]:
+    """Findings on masks that are wrong in themselves: empty, white, inverted, of another person."""
+    # In all cameras: then nothing else can be told. One camera has a finding of its own.
+    names = listed(score.name for score in scores)
+    wrong = "every mask must be white where the person is, and black elsewhere"
+    if scores and all(score.filled == 0 for score in scores):
+        text = f"all masks are empty ({names}); {wrong}"
+        return [Finding("error", TOPIC, text)]
+
+    # White everywhere, or inverted.
+    found = []
+    full = [score.name for score in scores if score.filled > FULL]
+    if full:
+        text = f"masks are white everywhere ({listed(full)}); {wrong}"
+        found.append(Finding("error", TOPIC, text))
+    inverted = []
+    for score in scores:
+        limit = max(score.overlap + limits.better_fit, CREDIBLE_OVERLAP)
+        if score.inverted > limit and score.name not in full:
+            inverted.append(
+                f"{score.name} {score.inverted:.2f}, as they are {score.overlap:.2f}"
+            )
+    if inverted:
+        text = (
+            f"the inverted masks would fit (overlap: {listed(inverted)}): the person must be white "
+            "and the background black; invert them"
+        )
+        found.append(Finding("error", TOPIC, text))
+
+    # A second body.
+    several = []
+    for score in scores:
+        if score.others > OTHER_IMAGES:
+            several.append(f"{score.name} {score.others:.0%}")
+    if several:
+        text = (
+            "masks have a second piece, as large as a person, that holds no joint (of the images: "
+            f"{listed(several)}): another person, whom training would learn as well; remove it "
+            "from the masks"
+        )
+        found.append(Finding("warning", TOPIC, text))
+    return found
 
 
 def _exchanged(one: CameraScore, other: CameraScore, limits: Limits) -> bool:

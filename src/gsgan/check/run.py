@@ -62,7 +62,7 @@ def check_data(
         messages = [str(error)]
         if isinstance(data.reader, CaptureReader) and data.root is not None:
             messages += capture_problems(
-                Path(data.root).expanduser(), data.limits
+                Path(data.root).expanduser(), data.limits, messages
             )
         return unreadable(data.root, messages)
     return CheckReport(

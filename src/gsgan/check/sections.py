@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,12 @@ import torch
 from rich.console import Console
 
 from gsgan.check import overlays, views
-from gsgan.check.calibration import calibration_findings, percent, score_cameras
+from gsgan.check.calibration import (
+    calibration_findings,
+    mask_findings,
+    percent,
+    score_cameras,
+)
 from gsgan.check.frames import (
     frame_findings,
     mask_doubts,
@@ -171,6 +176,7 @@ if TYPE_CHECKING:
 LISTED_BROKEN = 6
 # Maximum number of doubtful frames that are listed.
 TABLE_FRAMES = 40
+DOUBTFUL = "doubtful: "  # begins notes of a reader that are warnings
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
     "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
@@ -329,7 +335,7 @@ def _contents(m: Measurements) -> Section:
         contents.append(("note of the reader", note))
 
     # Damaged and missing images.
-    found = [*m.broken]
+    found = [*m.broken, *_doubtful_notes(layout.notes)]
     for name, files in subject.pairs.items():
         lacking = sorted(set(frames) - set(files))
         if lacking:
@@ -340,6 +346,13 @@ def _contents(m: Measurements) -> Section:
             )
     table = Table(("what", "how much"), contents)
     return Section("Contents", (table,), found)
+
+
+def _doubtful_notes(notes: Iterable[str]) -> Iterator[Finding]:
+    """Warnings on what the reader of the data found doubtful."""
+    for note in notes:
+        if note.startswith(DOUBTFUL):
+            yield Finding("warning", "files", note.removeprefix(DOUBTFUL))
 
 
 def _skeleton(m: Measurements) -> str:
@@ -395,9 +408,11 @@ def _agreement(m: Measurements) -> Section:
 
     # Findings by the thresholds that the reader of the data uses too.
     min_inside = m.subject.consistency.min_inside
-    found = calibration_findings(
-        m.cameras, m.limits, min_inside, m.geometry.far
-    )
+    found = mask_findings(m.cameras, m.limits)
+    if not any(finding.level == "error" for finding in found):
+        found += calibration_findings(
+            m.cameras, m.limits, min_inside, m.geometry.far
+        )
     return Section(
         "Skeleton, masks and cameras",
         (table,),

@@ -5,12 +5,10 @@ A silhouette estimated from the skeleton is what masks are compared with; pixel 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -36,6 +34,7 @@ from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, Ints
 from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
+from gsgan.utils.image_files import complete
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -44,10 +43,6 @@ if TYPE_CHECKING:
 MAX_OUTSIDE = 0.3
 # Pixels, maximum side of the masks that calibrations are tried on.
 SMALL_SIDE = 128
-# Bytes: some writers append a few after the end mark.
-TAIL = 64
-# The end of each format by its first bytes.
-END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
 # Metres of body around every bone: between an arm and a thigh.
 FLESH = 0.07
 # Metres around the middle of the face: half of a head's height.
@@ -145,7 +140,11 @@ class MaskView:
     outside: Float
     tolerance: float  # metres by which joints may lie outside
     fullness: float  # area of the mask over that of the estimated silhouette
+    # area of the largest piece of the mask without the body, over that of the pieces with it
+    other_piece: float
+    filled: float  # share of the image that the mask fills
     mask: Bool  # [h, w] small mask
+    shown: Bool  # [h, w] pixels of the small mask that lie in the image, not in its padding
     to_small: Float  # [3, 3] maps pixels of the whole image to the small mask
 
     def small(self, camera: CameraEntry) -> CameraEntry:
@@ -211,22 +210,6 @@ def cut_items(subject: CheckedData, maximum: int) -> list[Item]:
             if not all(map(complete, [layout.image_path(name, frame), *masks])):
                 found.append((name, frame))
     return found
-
-
-def complete(path: Path) -> bool:
-    """Whether a PNG or JPEG has its end mark; True for other files, False when unreadable."""
-    try:
-        with path.open("rb") as stream:
-            # The first bytes tell the format, the last ones whether it is complete.
-            start = stream.read(4)
-            stream.seek(max(0, os.fstat(stream.fileno()).st_size - TAIL))
-            tail = stream.read()
-    except OSError:
-        return False
-    for first, end in END_MARKS.items():
-        if start.startswith(first):
-            return end in tail
-    return bool(start)
 
 
 def measure(
@@ -295,6 +278,9 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     factor = min(1.0, SMALL_SIDE / max(height, width))
     small = [max(1, round(width * factor)), max(1, round(height * factor))]
     scale = np.diag([small[0] / width, small[1] / height, 1])
+    to_small = scale @ K @ np.linalg.inv(entry.K)
+    small_mask = cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5
+    shown = image_part(small_mask.shape, to_small, entry.size)
     return MaskView(
         camera=name,
         frame=number,
@@ -303,9 +289,38 @@ def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
             subject.consistency.joint_tolerance, TOLERANCE * metre_per_pixel
         ),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
-        mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
-        to_small=scale @ K @ np.linalg.inv(entry.K),
+        other_piece=other_piece(mask, body),
+        filled=float(small_mask[shown].mean()) if shown.any() else 0.0,
+        mask=small_mask,
+        shown=shown,
+        to_small=to_small,
     )
+
+
+def image_part(
+    shape: tuple[int, ...], to_part: Float, size: tuple[int, int]
+) -> Bool:
+    """``[h, w]`` the pixels of a window that lie inside an image of ``size`` ``(H, W)``, which
+    ``to_part [3, 3]`` maps to the window."""
+    low = to_part @ [0, 0, 1]
+    high = to_part @ [size[1], size[0], 1]
+    row = np.arange(shape[0]) + 0.5
+    column = np.arange(shape[1]) + 0.5
+    rows = (row > low[1]) & (row < high[1])
+    columns = (column > low[0]) & (column < high[0])
+    return rows[:, None] & columns
+
+
+def other_piece(mask: Bool, body: Bool) -> float:
+    """The area of the largest piece of a mask ``[H, W]`` that does not touch the ``body [H, W]``,
+    over the area of the pieces that do; 0 without any of either."""
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    areas = np.bincount(labels.ravel(), minlength=count).astype(float)
+    touching = np.zeros(count, bool)
+    touching[np.unique(labels[body])] = True
+    areas[0] = 0  # the background
+    own = areas[touching].sum()
+    return float(areas[~touching].max(initial=0) / own) if own else 0.0
 
 
 def body_silhouette(

@@ -50,8 +50,8 @@ PATTERNS = (
 PLACES = ("sparse", "sparse/0", "colmap/sparse/0")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, COLMAP's "
-    "cameras and images (.txt or .bin), nerfstudio's transforms.json, Qualisys' .qca.txt, or "
-    "cameras.json"
+    "cameras and images (.txt or .bin), nerfstudio's transforms.json, Qualisys' .qca.txt, JSON of "
+    "CMU Panoptic or THuman4.0, or cameras.json"
 )
 # formats whose worlds have no scale and any orientation
 WITHOUT_SCALE = ("COLMAP", "nerfstudio")
@@ -69,6 +69,14 @@ LENS_NAMES = (
     "distCoef",
     "D",
 )
+# of a camera in the JSON of Panoptic, THuman4.0 and AvatarReX
+DATASET_KEYS = {
+    "K": ("K",),
+    "R": ("R",),
+    "t": ("t", "T"),
+    "size": ("resolution", "imgSize"),
+    "dist": ("distCoef", "distCoeff"),
+}
 # of a camera's table in TOML
 TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 # tables that are no cameras
@@ -303,6 +311,44 @@ def _read_json(
     if scale:
         found = replace(found, scale=scale)
     return read_cameras(path, read_json(path), found)
+
+
+def _read_dataset_json(
+    path: Path, scale: float | None, pixel_centre: float, notes: list[str]
+) -> dict[str, CameraEntry]:
+    """The cameras of CMU Panoptic's JSON, in cm, or of THuman4.0's and AvatarReX's, in metres."""
+    content = read_json(path)
+    listed = content.get("cameras")
+    entries = content
+    if isinstance(listed, list):
+        entries = {str(entry.get("name")): entry for entry in listed}
+        scale = scale or 0.01
+    cameras = {}
+    for name, entry in entries.items():
+        where = f"{path}, camera {name}"
+
+        # The keys of either dataset.
+        given = {}
+        for key, names in DATASET_KEYS.items():
+            there = [name for name in names if name in entry]
+            if not there and key != "dist":
+                raise DataError(f"{where}: {' or '.join(names)} is missing")
+            given[key] = entry[there[0]] if there else None
+        width, height = numbers(where, given["size"], "size", (2,))
+        K = np.asarray(given["K"], np.float64).reshape(-1)
+        R = np.asarray(given["R"], np.float64).reshape(-1)
+        cameras[name] = make_camera(
+            where,
+            name,
+            K=K.reshape(3, 3) if K.size == 9 else K,
+            R=R.reshape(3, 3) if R.size == 9 else R,
+            t=np.asarray(given["t"], np.float64).reshape(-1),
+            dist=given["dist"],
+            size=(int(height), int(width)),
+            scale=scale or 1.0,
+            pixel_centre=pixel_centre,
+        )
+    return cameras
 
 
 # -- TOML of Pose2Sim, aniposelib and caliscope
@@ -676,6 +722,13 @@ FORMATS: dict[str, tuple[Callable[[Path, str], bool], Reader]] = {
         _read_qualisys,
     ),
     "nerfstudio": (lambda _, head: is_nerfstudio(head), _read_nerfstudio),
+    "JSON of Panoptic or THuman4.0": (
+        lambda _, head: (
+            head.lstrip().startswith("{")
+            and ('"imgSize"' in head or '"resolution"' in head)
+        ),
+        _read_dataset_json,
+    ),
     "cameras.json": (lambda _, head: head.lstrip().startswith("{"), _read_json),
     "TOML": (lambda _, head: "[" in head and "matrix" in head, _read_toml),
 }

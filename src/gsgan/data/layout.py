@@ -178,6 +178,24 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     return folder
 
 
+def _shifted_numbers(found: Found) -> list[str]:
+    """Notes on masks and landmarks whose numbers are those of the images but for their start."""
+    images = frames_of(found.images)
+    masks = sorted({frame for files in found.masks.values() for frame in files})
+    others = {"masks": masks, "landmarks": sorted(found.landmarks.p)}
+    notes = []
+    for what, numbers in others.items():
+        if len(numbers) != len(images) or numbers == images:
+            continue
+        first, other = images[0], numbers[0]
+        if [frame - first for frame in images] == [n - other for n in numbers]:
+            notes.append(
+                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
+                "alike, or every image gets what belongs to another moment"
+            )
+    return notes
+
+
 def assemble(found: Found, limits: Thresholds) -> Layout:
     """Checks the files against each other and leaves out those that cannot be used.
 
@@ -189,7 +207,7 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     cameras = found.cameras
     landmarks = found.landmarks
     calibration = found.calibration
-    notes = list(found.notes)
+    notes = [*found.notes, *_shifted_numbers(found)]
 
     # Frames need a skeleton, and cameras must fit the skeletons.
     images = drop_frames(

@@ -6,7 +6,7 @@ camera that stands still have one pose.
 
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, NamedTuple
 
@@ -81,7 +81,9 @@ def fixed_cameras(
 ) -> dict[str, CameraEntry]:
     """The cameras that took some images, by name.
 
-    If the images lie in several folders, each folder is a camera; otherwise each image is one.
+    If the images lie in several folders, a part of their paths that differs names the camera: the
+    last folder whose images have one pose, or the file for folders of moments. Otherwise each image
+    is a camera.
 
     Args:
         path: of the file, for messages.
@@ -91,17 +93,17 @@ def fixed_cameras(
     Raises:
         DataError: when a camera moves, or a value is impossible.
     """
-    # The images of each camera.
-    places = {PurePosixPath(view.image).parent for view in views}
-    groups: dict[str, list[CalibratedImage]] = {}
-    for view in views:
-        image = PurePosixPath(view.image)
-        name = image.parent.name if len(places) > 1 else image.stem
-        groups.setdefault(name, []).append(view)
-
     # The size of the whole rig, to compare moves with.
     centres = np.stack([view.centre for view in views])
     extent = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+
+    # The first way to name cameras by which none of them moves.
+    ways = _namings(views)
+    groups = ways[0]
+    for way in ways:
+        if _stand_still(way.values(), float(extent)):
+            groups = way
+            break
 
     cameras = {}
     for name, group in groups.items():
@@ -121,6 +123,54 @@ def fixed_cameras(
             scale=scale,
         )
     return cameras
+
+
+def _namings(
+    views: Sequence[CalibratedImage],
+) -> list[dict[str, list[CalibratedImage]]]:
+    """The ways to group images by camera, the likeliest first."""
+    # Windows separates folders by backslashes.
+    paths = [PurePosixPath(view.image.replace("\\", "/")) for view in views]
+    stems = [path.stem for path in paths]
+    if len({path.parent for path in paths}) == 1:
+        return [_grouped(stems, views)]
+
+    # The folders that differ, the last one first; folders of different depths have their own names.
+    ways = []
+    folders = [path.parent.parts for path in paths]
+    if len({len(parts) for parts in folders}) == 1:
+        for names in reversed(list(zip(*folders, strict=True))):
+            if len(set(names)) > 1:
+                ways.append(_grouped(names, views))
+    else:
+        ways.append(_grouped([path.parent.name for path in paths], views))
+
+    # Folders of moments hold the images of all cameras.
+    if len(set(stems)) < len(stems):
+        ways.append(_grouped(stems, views))
+    return ways
+
+
+def _grouped(
+    names: Sequence[str], views: Sequence[CalibratedImage]
+) -> dict[str, list[CalibratedImage]]:
+    """The images by name."""
+    groups: dict[str, list[CalibratedImage]] = {}
+    for name, view in zip(names, views, strict=True):
+        groups.setdefault(name, []).append(view)
+    return groups
+
+
+def _stand_still(
+    groups: Iterable[Sequence[CalibratedImage]], extent: float
+) -> bool:
+    """Whether all images of each camera have one pose."""
+    try:
+        for group in groups:
+            _one_pose("", group, extent)
+    except DataError:
+        return False
+    return True
 
 
 def _one_pose(
@@ -244,14 +294,27 @@ def _text_images(
     path: Path, lenses: Mapping[int, Lens]
 ) -> Iterator[CalibratedImage]:
     """The images of a text file: lines ``number qw qx qy qz tx ty tz camera name``, each with
-    a line of points below."""
-    lines = iter(read_text(path).splitlines())
-    for line in lines:
-        if not line.strip() or line.startswith("#"):
+    a line of points below, which may be missing."""
+    points = False  # whether the line may be points
+    for line in read_text(path).splitlines():
+        if line.startswith("#"):
             continue
-        _, *pose, camera, name = line.split(maxsplit=9)
-        yield _view(name, lenses, int(camera), list(map(float, pose)))
-        next(lines, None)
+        fields = line.split(maxsplit=9)
+        if points and not (len(fields) == 10 and is_name(fields[-1])):
+            points = False
+        elif fields:
+            _, *pose, camera, name = fields
+            yield _view(name, lenses, int(camera), list(map(float, pose)))
+            points = True
+
+
+def is_name(text: str) -> bool:
+    """Whether the end of a line is no list of numbers."""
+    try:
+        [float(part) for part in text.split()]
+    except ValueError:
+        return True
+    return False
 
 
 def _binary_lenses(path: Path) -> dict[int, Lens]:
@@ -373,9 +436,11 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
             )
         return float(numbers(where, values.get(key, default), key, ()))
 
-    # The focal length, or the angle of view that gives it.
-    width = value("w")
-    height = value("h")
+    # The focal length, or the angle of view that gives it. A file without a size means that of the
+    # images: then lengths are shares of the width, and the centre is a share of each side.
+    unsized = "camera_angle_x" in values and not {"w", "h"} & set(values)
+    width = 1.0 if unsized else value("w")
+    height = 1.0 if unsized else value("h")
     focal = None
     if "camera_angle_x" in values:
         focal = width / 2 / np.tan(value("camera_angle_x") / 2)
@@ -392,4 +457,5 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     if value("k4", 0) != 0:
         raise DataError(f"{where}: 'k4' is not supported; undistort the images")
     dist = [value(key, 0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    return Lens(K=K, dist=dist, size=(int(height), int(width)))
+    size = (0, 0) if unsized else (int(height), int(width))
+    return Lens(K=K, dist=dist, size=size)

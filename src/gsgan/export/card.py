@@ -20,6 +20,10 @@ LINEAR = (
 HOLDS = {
     "ply": "The avatar's Gaussians in one pose per file, in the convention of 3D Gaussian "
     "splatting. They show Step I's colour; the generator's image needs gsgan.",
+    "splat": "The avatar's Gaussians in one pose, in 32 bytes each, with Step I's colours from all "
+    "directions; the generator's image needs gsgan.",
+    "spz": "The avatar's Gaussians in one pose, compressed. They show Step I's colour; the "
+    "generator's image needs gsgan.",
     "gltf": "The avatar's Gaussians in one pose, as KHR_gaussian_splatting. They show Step I's "
     "colour; the generator's image needs gsgan.",
     "usd": "The avatar's Gaussians in one pose, or in the poses of a motion, as OpenUSD's "

@@ -25,7 +25,14 @@ from gsgan.export.motions import (
     motion_glb,
 )
 from gsgan.export.page import block, page, refuse_unsuitable
-from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.export.splats import (
+    Splats,
+    glb_bytes,
+    ply_bytes,
+    splat_bytes,
+    splats_of,
+    spz_bytes,
+)
 from gsgan.export.usd import refuse_missing_usd, usd_bytes
 from gsgan.export.weights import safetensors_file
 from gsgan.run.drive import (
@@ -47,6 +54,8 @@ from gsgan.utils.provenance import verify
 # The ending of each format's files, or nothing for a folder; a model card lies beside each file.
 ENDINGS = {
     "ply": ".ply",
+    "splat": ".splat",
+    "spz": ".spz",
     "gltf": ".glb",
     "usd": ".usdc",
     "onnx": ".onnx",
@@ -113,7 +122,7 @@ def export_config(config: DictConfig) -> None:
         _hub(config, run, out, tell)
         return
 
-    if kind in ("ply", "gltf", "usd"):
+    if kind in ("ply", "splat", "spz", "gltf", "usd"):
         _write_poses(config, run, out, console)
 
     # A page, or its content for a page of the user's own.
@@ -319,10 +328,15 @@ def _posed(run: Run, drive: Drive, i: int) -> Splats:
 
 
 def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
-    """The content of a .ply or .glb file of frame i."""
+    """The content of a .ply, .splat, .spz or .glb file of frame i."""
     splats = _posed(run, drive, i)
     if kind == "gltf":
         return glb_bytes(splats, run.proportions.up)
+    if kind == "splat":
+        return splat_bytes(splats)
+    if kind == "spz":
+        antialias = run.avatar.accuracy.antialias
+        return spz_bytes(splats, run.proportions.up, antialias)
     return ply_bytes(splats, run.avatar.accuracy.antialias)
 
 

@@ -1,13 +1,16 @@
 """The Gaussians of a pose as other programs expect them: scales, quaternions, harmonics in world
 axes; written as .ply (3D Gaussian splatting) and as glTF (KHR_gaussian_splatting)."""
 
+import gzip
 import math
+import struct
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional
 
@@ -24,6 +27,9 @@ DIRECTIONS = 64  # over which harmonics are fitted; 16 would do for rotations
 # metres: covariances are rounded to float32, and eigenvalues may be below 0
 THINNEST = 1e-7
 FAINTEST = 1e-30  # opacity of Gaussians that are not drawn, for a finite logit
+SPZ_MAGIC = 0x5053474E  # the letters NGSP
+FRACTION_BITS = 12  # of positions in .spz
+COLOUR_SCALE = 0.15  # of harmonics of degree 0 in .spz
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0  # glTF's number of this primitive mode
 
@@ -178,6 +184,87 @@ def ply_bytes(splats: Splats, antialias: bool = False) -> bytes:
     columns = [splats.means, np.zeros((count, 3)), *numbered.values()]
     rows = np.concatenate(columns, axis=1).astype("<f4")
     return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
+
+
+def splat_bytes(splats: Splats) -> bytes:
+    """A .splat file: 32 bytes for each Gaussian, the most visible ones first.
+
+    Positions and scales are floats, colours and opacities bytes, quaternions w x y z as bytes about
+    128. Colours are those from all directions: the format has no harmonics. Axes are the world's.
+
+    Source: the viewer by Kevin Kwok (antimatter15/splat), 2023.
+    """
+    colours = np.clip(0.5 + sh_basis_constant() * splats.sh[:, 0], 0, 1)
+    rows = np.zeros(
+        len(splats.means),
+        [("mean", "<3f4"), ("scale", "<3f4"), ("rgba", "4u1"), ("quat", "4u1")],
+    )
+    rows["mean"] = splats.means
+    rows["scale"] = splats.scales
+    rgba = np.c_[colours, splats.opacities]
+    rows["rgba"] = np.rint(255 * rgba)
+    rows["quat"] = np.rint(splats.quats * 128 + 128).clip(0, 255)
+
+    # Viewers draw the first part of a file before the rest has come.
+    size = splats.opacities * splats.scales.prod(axis=1)
+    return rows[np.argsort(-size, kind="stable")].tobytes()
+
+
+def spz_bytes(splats: Splats, up: str, antialias: bool = False) -> bytes:
+    """A .spz file of version 2: quantised columns, compressed by gzip.
+
+    The world, whose up axis is ``up``, is turned to Y up, as the format has it. Positions have 24
+    bits, of which 12 are fractions of a metre; all other numbers have 8, harmonics fewer.
+
+    Args:
+        splats: N Gaussians.
+        up: of their world.
+        antialias: whether opacities compensate for the low-pass filter, see `Accuracy`.
+
+    Source: github.com/nianticlabs/spz.
+    """
+    # Everything in axes with Y up.
+    count = len(splats.means)
+    turn = to_y_up(up)
+    means = splats.means @ turn.T
+    axes = Rotation.from_quat(np.roll(splats.quats, -1, axis=1))
+    quats = (Rotation.from_matrix(turn) * axes).as_quat()
+    quats *= np.where(quats[:, 3:] < 0, -1.0, 1.0)
+    frames = torch.from_numpy(turn).expand(1, count, 3, 3)
+    sh = in_world(torch.from_numpy(splats.sh).double()[None], frames)[0].numpy()
+
+    # Positions as whole numbers of three bytes.
+    fixed = np.rint(means * (1 << FRACTION_BITS)).astype("<i4")
+    positions = fixed[..., None].view(np.uint8).reshape(count, 3, 4)[..., :3]
+
+    # Colours of degree 0, logarithms of scales, and the vector part of quaternions.
+    colours = 255 * (COLOUR_SCALE * sh[:, 0] + 0.5)
+    scales = 16 * (np.log(splats.scales.astype(np.float64)) + 10)
+
+    # Of the harmonics above, degree 1 keeps 5 bits and all others 4.
+    rest = 128 + 128 * sh[:, 1:]
+    steps = np.where(np.arange(rest.shape[1]) < 3, 8, 16)[None, :, None]
+    rest = np.floor((rest + steps / 2) / steps) * steps
+    columns = [
+        255 * splats.opacities,
+        colours,
+        scales,
+        127.5 + 127.5 * quats[:, :3],
+        rest,
+    ]
+    degree = math.isqrt(splats.sh.shape[1]) - 1
+    header = struct.pack(
+        "<IIIBBBB", SPZ_MAGIC, 2, count, degree, FRACTION_BITS, antialias, 0
+    )
+    parts = [header, positions.tobytes()]
+    for column in columns:
+        parts.append(np.rint(column).clip(0, 255).astype(np.uint8).tobytes())
+    return gzip.compress(b"".join(parts), mtime=0)
+
+
+def sh_basis_constant() -> float:
+    """The harmonic of degree 0, the same in all directions."""
+    return float(sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 0)[0, 0])
 
 
 def glb_bytes(splats: Splats, up: str) -> bytes:

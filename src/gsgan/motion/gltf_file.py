@@ -2,6 +2,7 @@
 
 import base64
 import io
+import logging
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsgan.motion.character import Bytes
 from gsgan.motion.rotations import Array
 from gsgan.utils.errors import DataError
 
+logger = logging.getLogger(__name__)
 # numpy's types of glTF's numbers of component types.
 COMPONENT_TYPES = {
     5120: "i1",
@@ -50,13 +52,17 @@ class GltfFile:
     Args:
         path: of the file.
         unsupported: extensions without which it can be read only if they are not required.
+        known: beginnings of the names of all extensions that it may require; None: any others.
 
     Raises:
         DataError: when it is no glTF 2 file, or requires an unsupported extension.
     """
 
     def __init__(
-        self, path: Path, unsupported: tuple[str, ...] = UNSUPPORTED
+        self,
+        path: Path,
+        unsupported: tuple[str, ...] = UNSUPPORTED,
+        known: tuple[str, ...] | None = None,
     ) -> None:
         data = path.read_bytes()
         self.path = path
@@ -71,7 +77,8 @@ class GltfFile:
 
         # A required extension that is ignored would give wrong positions.
         for name in self.doc.extensionsRequired or ():
-            if name in unsupported:
+            unknown = known is not None and not name.startswith(known)
+            if name in unsupported or unknown:
                 raise DataError(
                     f"{path}: {name} is not supported; export it without"
                 )
@@ -131,24 +138,35 @@ class GltfFile:
         return values.astype(np.float64)
 
     def image(self, texture: int) -> Bytes:
-        """``[h, w, 4]`` sRGB and coverage of a texture, at most 2048 pixels a side."""
-        image = Image.open(io.BytesIO(self.image_bytes(texture))).convert(
-            "RGBA"
-        )
+        """``[h, w, 4]`` sRGB and coverage of a texture, at most 2048 pixels a side; white if it has
+        no image."""
+        content = self.image_bytes(texture)
+        if not content:
+            logger.warning(
+                "%s: texture %d has no image and is white", self.path, texture
+            )
+            return np.full((1, 1, 4), 255, np.uint8)
+        image = Image.open(io.BytesIO(content)).convert("RGBA")
         image.thumbnail((MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
         return np.asarray(image)
 
     def image_bytes(self, texture: int) -> bytes:
-        """The encoded image of a texture."""
+        """The encoded image of a texture; empty if it has none."""
         entry = self.doc.textures[texture]
-        webp = (entry.extensions or {}).get("EXT_texture_webp", {})
+        extensions = entry.extensions or {}
+        webp = extensions.get("EXT_texture_webp", {})
         source = webp.get("source", entry.source)
-        view = self.doc.images[source].bufferView
-        if view is None:
+        if source is None:
+            name = next(iter(extensions), "")
+            if not name:
+                return b""
             raise DataError(
-                f"{self.path}: image {source} is a separate file; export with embedded images"
+                f"{self.path}: {name} is not supported; export textures as PNG or JPEG"
             )
-        data, _ = self._view(view)
+        image = self.doc.images[source]
+        if image.bufferView is None:
+            return self._content(image.uri, "image")
+        data, _ = self._view(image.bufferView)
         return bytes(data)
 
     def _rows(
@@ -183,24 +201,27 @@ class GltfFile:
         if index not in self._buffers:
             # A buffer without a URI is the binary chunk of a .glb.
             uri = self.doc.buffers[index].uri
-            if uri is None:
-                data = self.doc.binary_blob() or b""
-            elif uri.startswith("data:"):
-                _, _, text = uri.partition(",")
-                data = base64.b64decode(text)
-            else:
-                # Only files beside this one are read: a URI could name any file
-                # of the user.
-                folder = self.path.parent.resolve()
-                file = (folder / unquote(uri)).resolve()
-                if not file.is_relative_to(folder) or not file.is_file():
-                    raise DataError(
-                        f"{self.path}: its buffer {uri} is not in the same folder; put it there, "
-                        "or export as .glb"
-                    )
-                data = file.read_bytes()
+            data = self.doc.binary_blob() or b""
+            if uri is not None:
+                data = self._content(uri, "buffer")
             self._buffers[index] = data
         return self._buffers[index]
+
+    def _content(self, uri: str, what: str) -> bytes:
+        """The bytes that a URI names: text in base64, or a file in the same folder."""
+        if uri.startswith("data:"):
+            _, _, text = uri.partition(",")
+            return base64.b64decode(text)
+
+        # Only files beside this one are read: a URI could name any file of the user.
+        folder = self.path.parent.resolve()
+        file = (folder / unquote(uri)).resolve()
+        if not file.is_relative_to(folder) or not file.is_file():
+            raise DataError(
+                f"{self.path}: its {what} {uri} is not in the same folder; put it there, or export "
+                "as .glb"
+            )
+        return file.read_bytes()
 
     def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
         """The bytes of a view of EXT_meshopt_compression."""

@@ -106,7 +106,7 @@ def read_points3d(path: Path) -> Points3D:
 
 def _read_trc(path: Path) -> Markers:
     try:
-        lines = read_text(path).splitlines()
+        lines = read_text(path, errors="replace").splitlines()
         header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
         markers = [name for name in lines[3].split("\t")[2:] if name]
 

@@ -19,7 +19,7 @@ from gsgan.data.skeletons import hips_below, usual_step, whole_frame_ids
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.clip import Clip, rate_of, usual_rate
-from gsgan.motion.points import read_points3d
+from gsgan.motion.points import json_files, read_points3d
 from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
 from gsgan.motion.standard import RigMotion, standard_motion
@@ -72,6 +72,17 @@ MAX_ANGLE = 30.0  # radians: a larger one is in degrees
 # but for their depth.
 MAX_FROM_HIPS = 0.2
 HIPS_DEPTH = 0.05
+SHARES = 0.95  # of coordinates from 0 to 1: they are shares of an image
+# Meshcapade's names of SMPL's arrays, and EasyMocap's of a fit.
+MESHCAPADE_KEYS = {
+    "bodyPose": "poses",
+    "bodyTranslation": "trans",
+    "shapeParameters": "betas",
+    "frameRate": "fps",
+}
+FIT_KEYS = ("Rh", "Th", "poses", "shapes")
+EASYMOCAP_SMPLX = 87  # SMPL-X's body, 6 numbers for each hand, jaw and eyes
+SMPLH_COUNTS = (52, 6890)  # joints and vertices of SMPL-H
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SCALE_KEY = "smpl_scaling"  # in AIST++: units of its translations in a metre
 # All arrays that are read, if a file has them.
@@ -123,14 +134,16 @@ def read_motion(path: Path, source: Source) -> Clip:
     Raises:
         DataError: when it cannot be read, has an unknown format, or holds no motion.
     """
-    if not path.is_file():
+    if not path.exists():
         raise DataError(
             f"motion={path} does not exist; give a file, or novel_pose or novel_view for the run's "
             "held-out frames"
         )
-    if path.stat().st_size == 0:
+    if path.is_file() and path.stat().st_size == 0:
         raise DataError(f"{path} is empty; expected a motion")
     reader = READERS.get(path.suffix.lower())
+    if path.is_dir():
+        reader = read_fits
     if reader is None:
         raise DataError(
             f"{path} has an unknown format; expected one of {', '.join(READERS)}"
@@ -175,11 +188,45 @@ def read_dictionary(path: Path, source: Source) -> Clip:
         raise DataError(
             f"{path} holds no dictionary; expected one of arrays, such as 'poses'"
         )
+    content = content.get(GVHMR_KEY, content)
     arrays = {key: as_floats(content[key]) for key in ARRAYS if key in content}
     for key, values in arrays.items():
         if not values.size:
             raise DataError(f"{path}: {key!r} must be an array of numbers")
     return _by_names(path, arrays, source)
+
+
+def read_meshcapade(path: Path, source: Source) -> Clip:
+    """Meshcapade's .smpl: an npz file of SMPL parameters with names of its own."""
+    given = read_arrays(path, MESHCAPADE_KEYS)
+    arrays = {MESHCAPADE_KEYS[key]: values for key, values in given.items()}
+    return _by_names(path, arrays, source)
+
+
+def read_fits(folder: Path, source: Source) -> Clip:
+    """EasyMocap's fits, one JSON file for each frame: SMPL parameters of the person with the
+    smallest id."""
+    frames: dict[str, list[Any]] = {key: [] for key in FIT_KEYS}
+    for path in json_files(folder).values():
+        content = read_json_value(path)
+        if isinstance(content, dict):
+            content = content.get("annots")
+        people = content if isinstance(content, list) else []
+        fits = [one for one in people if isinstance(one, dict)]
+        fits = [one for one in fits if set(FIT_KEYS) <= one.keys()]
+        if not fits:
+            raise DataError(
+                f"{path}: expected a fit of EasyMocap with {', '.join(FIT_KEYS)}"
+            )
+        fit = min(fits, key=lambda one: int(one.get("id", 0)))
+        for key in FIT_KEYS:
+            frames[key].append(as_floats(fit[key]).ravel())
+    arrays: dict[str, NDArray[Any]] = {}
+    for key, rows in frames.items():
+        if len({row.size for row in rows}) != 1:
+            raise DataError(f"{folder}: {key!r} differs in length by frame")
+        arrays[key] = np.stack(rows)
+    return _by_names(folder, arrays, source)
 
 
 def read_gvhmr(path: Path, source: Source) -> Clip:
@@ -393,13 +440,25 @@ def _smpl(
             "give smpl=/path/to/SMPL_NEUTRAL.pkl or SMPLX_NEUTRAL.npz (free for research from the "
             "model's own site, not part of gsgan)"
         )
+    if source.smpl.is_dir():
+        raise ConfigError(
+            f"smpl={source.smpl} is a folder; give the file in it, such as SMPL_NEUTRAL.pkl"
+        )
     if not source.smpl.is_file():
         raise ConfigError(
             f"smpl={source.smpl} does not exist; expected a .pkl or .npz file"
         )
 
-    # Poses, moves in metres and the median shape.
+    # Poses, moves in metres and the median shape. SMPL-H has the vertices of SMPL.
     model = read_smpl(source.smpl)
+    if (len(model.parents), len(model.v_template)) == SMPLH_COUNTS:
+        model = _without_fingers(model)
+    if model.kind == "generic":
+        raise DataError(
+            f"{source.smpl} is a model of {len(model.parents)} joints; expected SMPL (24), SMPL-H "
+            "(52) or SMPL-X (55)"
+        )
+    arrays = _first_track(arrays)
     poses = _smpl_poses(path, arrays)
     F = len(poses)
 
@@ -429,6 +488,36 @@ def _smpl(
     return Clip(
         path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres"
     )
+
+
+def _without_fingers(model: SkinnedModel) -> SkinnedModel:
+    """SMPL-H as SMPL: all joints of a hand become one, at the base of the index finger."""
+    hands = slice(SMPL_BODY, SMPL_BODY + 15), slice(SMPL_BODY + 15, None)
+    weights = [model.weights[:, :SMPL_BODY]]
+    rows = [model.J_regressor[:SMPL_BODY]]
+    for hand in hands:
+        weights.append(model.weights[:, hand].sum(1, keepdim=True))
+        rows.append(model.J_regressor[hand][:1])
+    return replace(
+        model,
+        kind="smpl",
+        parents=(*model.parents[:SMPL_BODY], 20, 21),
+        weights=torch.cat(weights, dim=1),
+        J_regressor=torch.cat(rows),
+        posedirs=model.posedirs[..., : 9 * (SMPL_BODY + 1)],
+    )
+
+
+def _first_track(arrays: dict[str, Any]) -> dict[str, Any]:
+    """The arrays of the first person of SLAHMR's files, whose arrays are [people, frames, n]."""
+    body = arrays.get("pose_body")
+    if body is None or body.ndim != 3 or body.shape[2] not in WITHOUT_ROOT:
+        return arrays
+    people = len(body)
+    return {
+        key: values[0] if values.ndim > 1 and len(values) == people else values
+        for key, values in arrays.items()
+    }
 
 
 def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
@@ -461,6 +550,8 @@ def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
         # ZJU-MoCap: Rh replaces the empty root.
         root = np.asarray(arrays["Rh"], np.float64).reshape(-1, 3)
         poses = np.concatenate([root, poses[:, 3:]], axis=1)
+        if poses.shape[1] == EASYMOCAP_SMPLX:
+            poses = poses[:, : 3 * SMPL_BODY]
     count = poses.shape[1]
     if count % 3 or count < 3 * SMPL_BODY or count in OTHER_ROTATIONS:
         raise DataError(
@@ -543,7 +634,9 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     if not named and all(isinstance(frame, list) for frame in frames):
         middle = np.nan_to_num(nanmedian(p[:, HIPS, :3].mean(1), axis=0))
         aside = np.linalg.norm(middle[:2]) > MAX_FROM_HIPS
-        if aside and abs(middle[2]) < HIPS_DEPTH:
+        flat = p[..., :2][np.isfinite(p[..., :2])]
+        shares = np.mean((flat >= 0) & (flat <= 1)) > SHARES
+        if aside and (shares or abs(middle[2]) < HIPS_DEPTH):
             raise DataError(
                 f"{path}: the middle of the hips is at {middle.round(2).tolist()}; expected "
                 "MediaPipe's world landmarks, in metres from there, not its image landmarks"
@@ -737,6 +830,7 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
     ".pt": read_gvhmr,
+    ".smpl": read_meshcapade,
     ".json": read_mediapipe_json,
     **dict.fromkeys(RIGS, _read_rig),
     ".trc": read_markers,

@@ -61,6 +61,8 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
+# Rigify numbers the bones of the trunk, from the hips to the head.
+RIGIFY = {"DEF-spine": "Hips", "DEF-spine.006": "Head"}
 # Regular expressions of the fingers' names.
 FINGER_ALIASES = {
     "Thumb": "thumb",
@@ -101,6 +103,9 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
 def _bone(name: str) -> tuple[str, int]:
     """The bone that a joint's name means, and the rank of this alias; ("", 0) for other names."""
     _, _, plain = name.rpartition(":")
+    if plain in RIGIFY:
+        return RIGIFY[plain], 0
+    plain = plain.removeprefix("DEF-")
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", plain)
 
     # The side is a word of its own, or the beginning of the first word.

@@ -80,9 +80,10 @@ def sample(
 
 def _extract(source: Recording, folder: Path, max_side: float) -> None:
     """Writes evenly spaced images, then their numbers and times."""
-    # Seconds between two images, and their scale.
+    # Seconds between two images, and their scale. A recording without a length is read once for it.
     rate = source.fps or 30.0
-    seconds = source.count / rate
+    count = source.count or _counted(source)
+    seconds = count / rate
     every = max(min(1 / IMAGE_RATE, seconds / FEW_IMAGES), seconds / MAX_IMAGES)
     shrink = min(1.0, max_side / max(source.size))
 
@@ -121,6 +122,16 @@ def _extract(source: Recording, folder: Path, max_side: float) -> None:
         times.append(now)
     video.release()
     write_npz(folder / TIMES, number=np.array(numbers), time=np.array(times))
+
+
+def _counted(source: Recording) -> int:
+    """The number of images of a video whose header has none."""
+    video = opened(source.path, True)
+    count = 0
+    while video.grab():
+        count += 1
+    video.release()
+    return count
 
 
 def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:

@@ -17,7 +17,7 @@ from gsgan.prepare.stages import Advance
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
-from gsgan.utils.frame_files import frame_files, last_number
+from gsgan.utils.frame_files import frame_files
 
 JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
@@ -56,7 +56,7 @@ def find_masks(
         of_persons = stems and all(
             re.fullmatch(r"\d+_\d+", stem) for stem in stems
         )
-        number = _first_number if of_persons else last_number
+        number = _first_number if of_persons else None
         files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(

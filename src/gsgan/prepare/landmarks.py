@@ -36,6 +36,7 @@ UNTOLD = (
 MAX_SHARE = (
     2.0  # of the image's size: a cut-off body may reach beyond the image
 )
+MAX_PEOPLE = 5  # of a file, those with most confidence
 MESH_LANDMARKS = 468  # landmarks of MediaPipe's face mesh
 # added to detectors that count from the centre of the first pixel
 PIXEL_CENTRE = 0.5
@@ -56,6 +57,15 @@ class Detections:
     px: Float
     conf: Float  # [F, J] in [0, 1], 0 = not seen
     notes: tuple[str, ...] = ()  # what is doubtful, for the user
+    # by frame, pixels and confidence of all people, the first as above; None: one at most
+    people: Sequence[Sequence[tuple[Float, Float]]] | None = None
+
+    @property
+    def crowded(self) -> list[int]:
+        """Numbers of the frames with several people."""
+        frames = self.frame_id.tolist()
+        rows = self.people or ()
+        return [frames[row] for row, all_ in enumerate(rows) if len(all_) > 1]
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -102,7 +112,10 @@ def read_detections(path: Path) -> Detections:
             f"{path}: all landmarks are between {seen.min():.2f} and {seen.max():.2f}; expected "
             "pixels of the image, not shares of its size"
         )
-    return Detections(found.frame_id[order], px, conf, found.notes)
+    people = found.people
+    if people is not None:
+        people = [people[row] for row in order.tolist()]
+    return Detections(found.frame_id[order], px, conf, found.notes, people)
 
 
 class Gathered(NamedTuple):
@@ -154,21 +167,26 @@ def inside(px: Float, conf: Float, sizes: Float) -> tuple[Float, Float]:
 
 
 def _read_json(path: Path) -> Detections:
-    """Detections in a folder of JSON files; of several people, the one with most confidence."""
-    # The person of each file, and the set of joints of all bodies together.
+    """Detections in a folder of JSON files; the person with most confidence is the first one."""
+    # The people of each file, and the set of joints of all bodies together.
     files = json_files(path)
-    best = []
+    found = []
     for file in files.values():
-        best.append(max(_read_people(file), key=_confidence, default=None))
-    bodies = [person.body for person in best if person is not None]
-    numbers, notes = joint_numbers(bodies)
+        seen = [one for one in _read_people(file) if _confidence(one) > 0]
+        found.append(sorted(seen, key=_confidence, reverse=True)[:MAX_PEOPLE])
+    numbers, notes = joint_numbers([p.body for all_ in found for p in all_])
 
     px = np.full((len(files), ALL, 2), np.nan)
     conf = np.zeros((len(files), ALL))
-    for f, person in enumerate(best):
-        if person is not None:
-            px[f], conf[f] = _joints(person, numbers)
-    return Detections(np.array(list(files)), px, conf, notes)
+    people = []
+    for f, persons in enumerate(found):
+        people.append([_joints(person, numbers) for person in persons])
+        if persons:
+            px[f], conf[f] = people[f][0]
+    several = max(map(len, people)) > 1
+    return Detections(
+        np.array(list(files)), px, conf, notes, people if several else None
+    )
 
 
 def _read_npz(path: Path) -> Detections:

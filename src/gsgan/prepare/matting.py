@@ -153,7 +153,7 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
     reach = _pixels(mask, BAND)
     window = _window(mask, 4 * reach)
     seen = image[window].astype(np.float32)
-    prior = mask[window].astype(np.float32) / 255
+    prior = np.asarray(mask[window] / 255, np.float32)
     solid = (prior > 0.5).astype(np.uint8)
     inside = cv2.erode(solid, _disc(reach)) > 0
     outside = cv2.dilate(solid, _disc(reach)) == 0
@@ -161,15 +161,16 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
 
     # The room in this image, with its exposure; unknown if the camera has moved.
     known = room.known[window]
-    empty: Single = room.colour[window].astype(np.float32)
+    empty = room.colour[window].astype(np.float32)
     shown = outside & known
     if shown.any():
-        empty = empty * _exposure(seen[shown], empty[shown])
+        exposure = _exposure(seen[shown], empty[shown])
+        empty = np.asarray(empty * exposure, np.float32)
         change = np.abs(seen[shown] - empty[shown]).mean(-1)
         known = known & bool(np.median(change) < MAX_CHANGE)
 
     # Whether each pixel is the person: the mask's evidence, and how unlike the room it is.
-    behind = _shadowed(seen, np.asarray(empty, np.float32), prior)
+    behind = _shadowed(seen, empty, prior)
     unlike = ((seen - behind) ** 2).sum(-1) / (2 * ROOM_NOISE**2) - UNSURE
     unlike = np.where(known, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
     blurred = cv2.GaussianBlur(prior, (0, 0), reach / 2).clip(0.02, 0.98)

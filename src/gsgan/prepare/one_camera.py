@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,7 +39,13 @@ from gsgan.prepare.one_view import (
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
 from gsgan.prepare.sides import WHOLE_BODY, sides_of_sequence
 from gsgan.prepare.solve import Solution
-from gsgan.prepare.sources import Recording, stamp, video_recording
+from gsgan.prepare.sources import (
+    MIN_DECODED,
+    Recording,
+    read_metadata,
+    stamp,
+    video_recording,
+)
 from gsgan.prepare.stages import StageFolder
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
@@ -57,16 +62,11 @@ from gsgan.skeleton.proportions import degrees_seen
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.pickles import read_arrays
 
-# Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
-FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
-# Transfer functions of HDR video, by their numbers in ITU-T H.273.
-HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
 DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
 # The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background
 # that moves more, more images of several people, or fewer images of the feet.
-MIN_DECODED = 0.9  # share of the frames that the video's header states
 MIN_SECONDS = 8.0  # seconds
 MIN_CAMERA_TURN = 300  # degrees
 MAX_BACKGROUND_MOVE = 0.03  # share of the image
@@ -187,7 +187,8 @@ def solve_video(
     measured["focal_stated"] = metadata.focal
     measured["hdr"] = metadata.hdr
     stated = video_recording(video, rotate=True).count
-    measured["decoded"] = (numbers[-1] + usual_step(numbers)) / stated
+    decoded = numbers[-1] + usual_step(numbers)
+    measured["decoded"] = decoded / (stated or decoded)
     notes = _notes(measured, options, natural_height(view.shape))
     fps = float(np.median(np.diff(numbers) / np.diff(time)))
     inputs = Inputs(
@@ -285,26 +286,6 @@ def with_right_sides(seen: Detected, time: Float) -> Detected:
     for values in (px[:, HANDS], conf[:, HANDS], hand_z):
         values[crossed] = np.roll(values[crossed], HAND, axis=1)
     return replace(seen, px=px, conf=conf, world=world, hand_z=hand_z)
-
-
-class Metadata(NamedTuple):
-    """What a video's metadata state."""
-
-    focal: float | None = None  # millimetres on film of 36 x 24 mm
-    hdr: str | None = None  # the transfer function of HDR colours
-
-
-def read_metadata(video: Path) -> Metadata:
-    """The metadata of a video; nothing is known without the extra ``render``."""
-    try:
-        import av
-    except ImportError:
-        return Metadata()
-    with av.open(str(video)) as file:
-        stated = re.match(r"[\d.]+", file.metadata.get(FOCAL_KEY, ""))
-        transfer = file.streams.video[0].codec_context.color_trc
-    focal = None if stated is None else float(stated[0]) or None
-    return Metadata(focal, HDR_TRANSFERS.get(transfer))
 
 
 def _solve(

@@ -20,6 +20,7 @@ from gsgan.prepare.sources import (
     fit_size,
     pair_cameras,
     recording_notes,
+    upright,
 )
 from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.checks import above, between, one_of, whole
@@ -225,14 +226,15 @@ def read_inputs(options: Options) -> Inputs:
     )
     notes = list(calibration.notes)
     cameras = []
-    for name, source in sources.items():
+    for name in list(sources):
         camera = calibration.cameras[pairs[name]]
+        sources[name], turned = upright(sources[name], camera.size)
+        size = sources[name].size
         fitted, note = fit_size(
-            camera, name, source.size, options.crop_px, calibration.path
+            camera, name, size, options.crop_px, calibration.path
         )
         cameras.append(fitted)
-        if note is not None:
-            notes.append(note)
+        notes += [text for text in (turned, note) if text is not None]
     unused = sorted(set(calibration.cameras) - set(pairs.values()))
     if unused:
         notes.append(

@@ -1,7 +1,7 @@
 """`gsgan.prepare`: videos in, a capture for `data=capture` out."""
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from rich.console import Console
 from gsgan.check.report import Table
 from gsgan.check.run import check_capture
 from gsgan.data.pixels import read_mask_values
+from gsgan.data.skeletons import usual_step
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
@@ -23,6 +24,7 @@ from gsgan.prepare.camera_array import (
     camera_moves,
     undistort_points,
 )
+from gsgan.prepare.clocks import DRIFT, by_time, renumbered, unsteady_clocks
 from gsgan.prepare.dataset import (
     Outcome,
     exists,
@@ -36,7 +38,7 @@ from gsgan.prepare.images import write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.matting import Room, Studied, study_room, tidy
 from gsgan.prepare.mediapipe import find_people, tool_key
-from gsgan.prepare.one_camera import solve_video
+from gsgan.prepare.one_camera import MAX_OTHER_FACES, solve_video
 from gsgan.prepare.one_view import USUAL_HEIGHT
 from gsgan.prepare.options import (
     MEDIAPIPE,
@@ -45,6 +47,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
+from gsgan.prepare.people import one_person
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -54,6 +57,7 @@ from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, write_json
+from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
@@ -119,7 +123,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
         "notes": [
             *inputs.notes,
             *_camera_notes(solution, turned),
-            *_late_clocks(solution, inputs.sources),
+            *_late_clocks(outcome),
         ],
         "settings": outcome.options.record(),
     }
@@ -141,18 +145,25 @@ def _camera_notes(solution: Solution, turned: Float) -> list[str]:
     ]
 
 
-def _late_clocks(solution: Solution, names: Iterable[str]) -> list[str]:
-    """Notes on cameras whose clocks are late."""
-    notes = []
+def _late_clocks(outcome: Outcome) -> list[str]:
+    """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
+    # Delays are counted in the chosen frames, of which only every n-th may be there.
+    solution = outcome.solution
+    step = usual_step(outcome.frames)
+    offsets = dict(outcome.options.offsets or {})
+    late = []
     for name, delay, gain in zip(
-        names, solution.delay, solution.gain, strict=True
+        outcome.inputs.sources, solution.delay, solution.gain, strict=True
     ):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
-            text = (
-                f"its clock seems {delay:+.1f} frames late; if so, set offsets="
-            )
-            notes.append(f"{name}: {text}{{{name}: {round(delay)}}}")
-    return notes
+            late.append(f"{name} {step * delay:+.1f}")
+            offsets[name] = offsets.get(name, 0) + round(step * delay)
+    if not late:
+        return []
+    text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
+    return [
+        f"clocks seem late, in frames: {', '.join(late)}; if so, set offsets={{{text}}}"
+    ]
 
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
@@ -245,45 +256,23 @@ def prepare(options: Options, console: Console) -> Path:
 
     # Joints, cameras and masks, from one camera or from several.
     stages = StageFolder(out.parent / f".{out.name}.prepare")
-    extra: dict[str, object] = {}
     if inputs is None:
-        # One camera: the body is solved in its view, and joints come from it.
-        filmed = solve_video(options, stages, console)
-        inputs = filmed.inputs
-        masks = filmed.masks
-        frames = filmed.frames
-        solution = filmed.solution
-        rooms = _silhouettes(options, inputs.sources, masks).rooms
-        extra = {"one_camera": filmed.numbers}
+        solved = _from_one_video(options, stages, console)
         options = replace(options, face=False)
     else:
-        # Several cameras: detections, then triangulation.
-        found, masks = find_people(
-            options, inputs.sources, stages, console.print
-        )
-        inputs, detections = with_detections(inputs, found)
-        frames, uv, conf = _undistorted(options, inputs, detections)
-        if options.calibration == PERSON:
-            inputs = _from_person(options, inputs, frames, uv, conf, console)
-        if not inputs.calibration.metric:
-            inputs = _in_metres(options, inputs, uv, conf)
-        silhouettes = _silhouettes(options, inputs.sources, masks)
-        rooms = silhouettes.rooms
-        solution = _solved(
-            options, inputs, frames, uv, conf, silhouettes.alphas, console
-        )
+        solved = _from_several(options, inputs, stages, console)
 
     # The dataset, in a folder of its own until it is complete; a run that was killed leaves one.
     root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)
 
     # The dataset appears at once, when it is complete.
-    written = _write_images(
-        options, inputs, masks, rooms, frames, solution, root
+    written = _write_images(options, solved, root)
+    outcome = Outcome(
+        options, solved.inputs, solved.frames, solved.solution, written
     )
-    outcome = Outcome(options, inputs, frames, solution, written)
     write_files(root, outcome, key)
-    numbers = summarise(outcome) | extra
+    numbers = summarise(outcome) | solved.numbers
     write_json(root / "prepare.json", numbers)
     publish(root, out)
 
@@ -296,15 +285,78 @@ def prepare(options: Options, console: Console) -> Path:
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
     _refuse_errors(out)
+    _refuse_unsteady(out, solved.inputs, solved.drift)
     lines = (
         f"{out} is ready; look at {out / 'check.html'}, then",
-        f"python -m gsgan.fit data=capture data.root={out}",
         f"python -m gsgan.train data=capture data.root={out}",
     )
     console.print(
         "\n".join(lines), markup=False, highlight=False, soft_wrap=True
     )
     return out
+
+
+class Solved(NamedTuple):
+    """All that is known of a recording before its images are written."""
+
+    inputs: Inputs
+    masks: Mapping[str, Mapping[int, Path]]
+    rooms: Mapping[str, Room | None]
+    frames: Ints  # [F]
+    solution: Solution
+    drift: Float  # [C] of each camera's clock, see `unsteady_clocks`
+    numbers: dict[str, object]  # for prepare.json
+
+
+def _from_one_video(
+    options: Options, stages: StageFolder, console: Console
+) -> Solved:
+    """One camera: the body is solved in its view, and joints come from it."""
+    filmed = solve_video(options, stages, console)
+    sources = filmed.inputs.sources
+    return Solved(
+        inputs=filmed.inputs,
+        masks=filmed.masks,
+        rooms=_silhouettes(options, sources, filmed.masks).rooms,
+        frames=filmed.frames,
+        solution=filmed.solution,
+        drift=np.zeros(1),
+        numbers={"one_camera": filmed.numbers},
+    )
+
+
+def _from_several(
+    options: Options, inputs: Inputs, stages: StageFolder, console: Console
+) -> Solved:
+    """Several cameras: detections of one person, cameras in metres, joints in 3D."""
+    found, masks = find_people(options, inputs.sources, stages, console.print)
+    inputs, masks = _with_times(options, inputs, masks, stages)
+    inputs, detections = with_detections(inputs, found)
+    inputs, detections = _with_one_person(options, inputs, detections)
+    frames, uv, conf = _undistorted(options, inputs, detections)
+
+    # Cameras that are not calibrated, or not in metres.
+    if options.calibration == PERSON:
+        inputs = _from_person(options, inputs, frames, uv, conf, console)
+    if not inputs.calibration.metric:
+        inputs = _in_metres(options, inputs, uv, conf)
+
+    # The joints, and the clocks of the cameras.
+    silhouettes = _silhouettes(options, inputs.sources, masks)
+    alphas = silhouettes.alphas
+    return Solved(
+        inputs=inputs,
+        masks=masks,
+        rooms=silhouettes.rooms,
+        frames=frames,
+        solution=_solved(options, inputs, frames, uv, conf, alphas, console),
+        drift=unsteady_clocks(
+            CameraArray.of(inputs.cameras),
+            uv[:, :, :BODY],
+            conf[:, :, :BODY],
+        ),
+        numbers={},
+    )
 
 
 def with_detections(
@@ -319,10 +371,89 @@ def with_detections(
     notes = [*inputs.notes]
     detections = {}
     for name in inputs.sources:
-        detections[name] = landmarks.read_detections(found[name])
-        for note in detections[name].notes:
+        read = landmarks.read_detections(found[name])
+        detections[name] = in_common(read, inputs.sources[name])
+        for note in read.notes:
             notes.append(f"{name}: {note}")
+
+        # MediaPipe follows one person, and counts the faces.
+        if found[name].is_file():
+            faces = read_arrays(found[name], ("faces",)).get("faces")
+            several = 0 if faces is None else int((faces > 1).sum())
+            if faces is not None and several > MAX_OTHER_FACES * len(faces):
+                notes.append(
+                    f"doubtful: {name}: several people were detected in {several} of {len(faces)} "
+                    "frames; give landmarks and masks of one person if they are mixed up"
+                )
     return replace(inputs, notes=notes), detections
+
+
+def in_common(found: Detections, source: Recording) -> Detections:
+    """Detections by the frame numbers that all cameras share, in place of the source's own."""
+    rows = dict(enumerate(found.frame_id.tolist()))
+    by_number = renumbered(
+        {number: row for row, number in rows.items()}, source
+    )
+    numbers = np.array(sorted(by_number), np.int64)
+    at = [by_number[number] for number in numbers.tolist()]
+    people = found.people
+    return replace(
+        found,
+        frame_id=numbers,
+        px=found.px[at],
+        conf=found.conf[at],
+        people=None if people is None else [people[row] for row in at],
+    )
+
+
+def _with_one_person(
+    options: Options, inputs: Inputs, detections: dict[str, Detections]
+) -> tuple[Inputs, dict[str, Detections]]:
+    """The inputs with a note on other people, and detections of one person."""
+    # Cameras that are yet to be found cannot tell people apart.
+    if options.calibration == PERSON:
+        return inputs, detections
+    chosen, notes = one_person(
+        detections, inputs.cameras, options.offsets or {}
+    )
+    return replace(inputs, notes=[*inputs.notes, *notes]), chosen
+
+
+def _with_times(
+    options: Options,
+    inputs: Inputs,
+    masks: Mapping[str, Mapping[int, Path]],
+    stages: StageFolder,
+) -> tuple[Inputs, dict[str, dict[int, Path]]]:
+    """The inputs and masks with frame numbers that stand for the same moments, by the time stamps
+    of the videos."""
+    timed = by_time(inputs.sources, stages, options.workers)
+    fps = inputs.fps
+    if timed.rate is not None and options.fps is None:
+        fps = timed.rate
+    in_time = replace(
+        inputs,
+        sources=timed.sources,
+        fps=fps,
+        notes=[*inputs.notes, *timed.notes],
+    )
+    renamed = {
+        name: renumbered(masks[name], source)
+        for name, source in timed.sources.items()
+    }
+    return in_time, renamed
+
+
+def _refuse_unsteady(out: Path, inputs: Inputs, drift: Float) -> None:
+    """Raises a DataError if a camera's clock ``drift [C]`` shows that it lost frames."""
+    for name, frames in zip(inputs.sources, drift, strict=True):
+        if abs(frames) > DRIFT:
+            raise DataError(
+                f"{out} was written, but the clock of {name} is {frames:+.1f} frames later at the "
+                "end than at the beginning, against the other cameras: it lost frames without a "
+                "gap in its time stamps, or runs at another rate; give folders of images, numbered "
+                "alike in all cameras, or use the part before with frames="
+            )
 
 
 def _refuse_errors(out: Path) -> None:
@@ -363,7 +494,7 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
 
 
 def _undistorted(
-    options: Options, inputs: Inputs, detections: Mapping[str, Detections]
+    options: Options, inputs: Inputs, detections: dict[str, Detections]
 ) -> tuple[Ints, Float, Float]:
     """The chosen frames ``[F]``; undistorted pixels ``[C, F, J, 2]``, confidence ``[C, F, J]``."""
     # The chosen frames.
@@ -598,19 +729,16 @@ def _check_distance(inputs: Inputs, p: Float) -> None:
 
 
 def _write_images(
-    options: Options,
-    inputs: Inputs,
-    masks: Mapping[str, Mapping[int, Path]],
-    rooms: Mapping[str, Room | None],
-    frames: Ints,
-    solution: Solution,
-    root: Path,
+    options: Options, solved: Solved, root: Path
 ) -> dict[str, list[int]]:
     """Writes the images of every frame that has a skeleton."""
+    inputs = solved.inputs
+    solution = solved.solution
+
     # Frames without a joint of the body are left out; hands and a face alone are no person.
     body = [joint for joint in range(BODY) if joint not in FROM_PARTS]
     has_joint = known(solution.p[:, body]).any(1)
-    posed = set(frames[has_joint].tolist())
+    posed = set(solved.frames[has_joint].tolist())
     if not posed:
         raise DataError(
             f"{options.landmarks}: no body joint of any frame came out in "
@@ -625,13 +753,13 @@ def _write_images(
             root=root,
             camera=cameras[name],
             source=inputs.sources[name],
-            masks=masks[name],
+            masks=solved.masks[name],
             frames=posed,
             offset=offsets.get(name, 0),
             scale=options.scale,
             suffix=options.format,
             levels=options.mask_levels,
-            room=rooms[name],
+            room=solved.rooms[name],
             advance=advance,
         )
 

@@ -14,6 +14,7 @@ from gsgan.prepare.camera_array import (
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.clocks import clock_errors
 from gsgan.prepare.frontier import Outline, frontier_points
 from gsgan.prepare.many_views import Views, solve_views
 from gsgan.prepare.sides import (
@@ -250,10 +251,11 @@ def solve(
         of_body = values.reshape(conf.shape)[:, :, :BODY]
         stages_in_pixels[name] = of_body * to_pixels
 
+    # Clocks by the given cameras: late ones would bend the refined cameras.
     delay, gain = clock_errors(
-        cameras,
-        found.uv[:, :, :BODY],
-        found.weight[:, :, :BODY],
+        given,
+        uv[:, :, :BODY],
+        np.where(conf > settings.min_confidence, conf, 0.0)[:, :, :BODY],
     )
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
@@ -469,68 +471,6 @@ def _mean_seen(values: Float, weight: Float) -> Float:
     """The mean ``[F, J]`` over the cameras that see a joint."""
     views = (weight > 0).sum(0)
     return values.sum(0) / np.maximum(views, 1)
-
-
-def clock_errors(
-    cameras: CameraArray, uv: Float, weight: Float
-) -> tuple[Float, Float]:
-    """Each camera's delay against the others, and the gain of correcting it.
-
-    Delays are in frames; with a positive delay the camera shows a later moment than the others at
-    the same number, so its numbers should grow by that much. Joints are triangulated without the
-    camera, so three cameras are needed; with two the delay is NaN. Between frames a parabola
-    through the three best lags decides.
-
-    Args:
-        cameras: ``C`` cameras.
-        uv: ``[C, F, J, 2]`` undistorted pixels.
-        weight: ``[C, F, J]`` their confidence.
-
-    Returns:
-        ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
-    """
-    C, F, _ = weight.shape
-    delay = np.full(C, np.nan)
-    gain = np.full(C, np.nan)
-
-    # Two cameras cannot tell whose clock is late.
-    lag = min(LAG, F - 1)
-    cameras, uv = cameras.normalised(uv)
-    if C <= MIN_VIEWS or lag < 1:
-        return delay, gain
-    for c in range(C):
-        # The joints as the other cameras see them, in this camera.
-        others = np.arange(C) != c
-        points = robust(
-            cameras[others], _flat(uv[others]), _flat(weight[others])
-        )
-        projected, _ = cameras.project(points.p)
-        expected = projected[c].reshape(uv.shape[1:])
-        seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
-
-        # The camera's frame f against the others' frame f - s.
-        errors = []
-        for s in range(-lag, lag + 1):
-            ours = seen[max(s, 0) : F + min(s, 0)]
-            theirs = expected[max(-s, 0) : F - max(s, 0)]
-            errors.append(median(np.linalg.norm(ours - theirs, axis=-1)))
-        # The best lag, between frames by a parabola.
-        if np.isfinite(errors[lag]):
-            best = int(np.nanargmin(errors))
-            delay[c] = lag - best - _vertex(errors[max(best - 1, 0) : best + 2])
-            gain[c] = 1 - errors[best] / max(errors[lag], 1e-12)
-    return delay, gain
-
-
-def _vertex(values: list[float]) -> float:
-    """The minimum of a parabola through values at -1, 0, 1; 0 if there are fewer or no minimum."""
-    if len(values) < 3:
-        return 0.0
-    before, at, after = values
-    curvature = before - 2 * at + after
-    if not curvature > 0:
-        return 0.0
-    return 0.5 * (before - after) / curvature
 
 
 def median(values: Float) -> float:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -30,7 +31,12 @@ INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
 
 # shares of the image between which a principal point lies
 CENTRAL = (0.1, 0.9)
-# share by which frame rates or lengths must differ to be noted
+# Apple's phones state the focal length here, in millimetres; not the recorded part of the image.
+FOCAL_KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+# Transfer functions of HDR video, by their numbers in ITU-T H.273.
+HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
+MIN_DECODED = 0.9  # share of the frames that a video's header states
+# share by which lengths must differ to be noted
 DIFFERENT = 0.01
 
 
@@ -43,14 +49,23 @@ class Recording:
     size: tuple[int, int]  # (H, W) pixels as read
     fps: float | None  # None for images or when the video does not have it
     files: Mapping[int, Path]  # of a folder, by number; empty for a video
-    count: int  # images; for a video its header's value, which may be wrong
+    # images; for a video its header's value, which may be wrong, or None
+    count: int | None
     turned: int = 0  # degrees of rotation in the video's metadata
     rotate: bool = False  # whether that rotation is applied
+    # of a video, by image: the frame number that all cameras share; None: the image's own number
+    common: Mapping[int, int] | None = None
 
     def images(self) -> Iterator[tuple[int, Bytes]]:
-        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0."""
+        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0, or by
+        ``common``."""
         if not self.files:
-            yield from enumerate(_decoded(opened(self.path, self.rotate)))
+            video = opened(self.path, self.rotate)
+            for i, shown in enumerate(_decoded(video)):
+                if self.common is None:
+                    yield i, shown
+                elif i in self.common:
+                    yield self.common[i], shown
         for number, path in self.files.items():
             image = cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR)
             yield number, np.asarray(image, np.uint8)
@@ -141,7 +156,7 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     video = opened(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
-    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    count = _length(video)
 
     # The header's size may differ from that of the images.
     first = next(_decoded(video), None)
@@ -156,7 +171,7 @@ def video_recording(path: Path, rotate: bool) -> Recording:
         size=(h, w),
         fps=fps if np.isfinite(fps) and fps > 0 else None,
         files={},
-        count=count,
+        count=count if count > 0 else None,
         turned=turned,
         rotate=rotate,
     )
@@ -168,13 +183,23 @@ def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
     Raises:
         DataError: when it cannot be opened.
     """
+    if path.is_file() and path.stat().st_size == 0:
+        raise DataError(
+            f"{path} is empty (0 bytes); copy it or export it again"
+        )
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise DataError(
-            f"{path} cannot be opened as a video; convert it to H.264 MP4"
+            f"{path} cannot be opened as a video; copy it again if it was cut off, else convert it "
+            "to H.264 MP4"
         )
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return video
+
+
+def _length(video: cv2.VideoCapture) -> int:
+    """The number of images by the header; 0 or a huge negative number where it has none."""
+    return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
 def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
@@ -257,6 +282,11 @@ def fit_size(
     """
     fitted = replace(camera, name=name, size=size)
     h, w = size
+    if camera.size == (0, 0) and camera.K[:2, 2].max() <= 1:
+        # An angle of view alone: lengths are shares of the width, the centre of each side.
+        K = camera.K * [[w], [w], [1]]
+        K[:2, 2] = camera.K[:2, 2] * (w, h)
+        return replace(fitted, K=K), None
     if camera.size == (0, 0):
         # Without a size, the principal point tells whether the images were larger.
         centre = camera.K[:2, 2]
@@ -281,31 +311,73 @@ def fit_size(
     )
 
 
+def upright(
+    source: Recording, calibrated: tuple[int, int]
+) -> tuple[Recording, str | None]:
+    """A recording with the rotation of its metadata applied where that alone makes its size the
+    ``calibrated`` one ``(H, W)``, and a note on that."""
+    swapped = source.size[::-1]
+    if source.turned % 180 == 0 or source.rotate:
+        return source, None
+    if calibrated == source.size or calibrated != swapped:
+        return source, None
+    note = (
+        f"{source.name}: turned by the {source.turned} degrees of its metadata, as it was "
+        "calibrated (apply_rotation=true turns all videos)"
+    )
+    return replace(source, size=swapped, rotate=True), note
+
+
 def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
-    """Notes on frame rates and lengths that differ, and on rotation metadata."""
-    rates = {}
+    """Notes on lengths that differ, HDR colours, and rotation metadata."""
+    # Numbers of frames that are known, and differ.
+    notes = []
     counts = {}
     for name, source in sources.items():
-        counts[name] = source.count
-        if source.fps:
-            rates[name] = source.fps
-
-    # Rates and counts that differ.
-    notes = []
-    for what, values in (("frame rates", rates), ("numbers of frames", counts)):
-        if values and max(values.values()) > (1 + DIFFERENT) * min(
-            values.values()
-        ):
+        if source.count is not None:
+            counts[name] = source.count
+    if counts:
+        longest = max(counts.values())
+        if longest > (1 + DIFFERENT) * min(counts.values()):
             text = ", ".join(
-                f"{name} {value:g}" for name, value in values.items()
+                f"{name} {count}" for name, count in counts.items()
             )
-            notes.append(f"{what} differ ({text}); frames are paired by number")
+            notes.append(f"numbers of frames differ ({text})")
 
-    # Rotations that are not applied.
+    # Colours, and rotations that are not applied.
     for name, source in sources.items():
+        hdr = None if source.files else read_metadata(source.path).hdr
+        if hdr:
+            notes.append(
+                f"doubtful: {name}: its colours are HDR ({hdr}) and are not converted, so the "
+                "avatar's will be wrong; film without HDR, or convert the video"
+            )
         if source.turned and not source.rotate:
             notes.append(
                 f"{name}: its metadata rotate it by {source.turned} degrees, which is not applied; "
                 "set apply_rotation=true if it was calibrated that way"
             )
     return notes
+
+
+class Metadata(NamedTuple):
+    """What a video's metadata state."""
+
+    focal: float | None = None  # millimetres on film of 36 x 24 mm
+    hdr: str | None = None  # the transfer function of HDR colours
+
+
+def read_metadata(video: Path) -> Metadata:
+    """The metadata of a video; nothing is known without the extra ``render``."""
+    try:
+        import av
+    except ImportError:
+        return Metadata()
+    try:
+        with av.open(str(video)) as file:
+            stated = re.match(r"[\d.]+", file.metadata.get(FOCAL_KEY, ""))
+            transfer = file.streams.video[0].codec_context.color_trc
+    except (av.FFmpegError, IndexError):
+        return Metadata()
+    focal = None if stated is None else float(stated[0]) or None
+    return Metadata(focal, HDR_TRANSFERS.get(transfer))

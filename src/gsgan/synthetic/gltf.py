@@ -1,12 +1,14 @@
 """Any rigged ``.glb`` as a `Character`: VALID, Ready Player Me, Mixamo, VRoid and their like."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from pygltflib import TextureInfo
 from scipy.spatial.transform import Rotation
 
 from gsgan.body.skinned import vertex_normals
@@ -24,12 +26,14 @@ from gsgan.motion.humanoid import (
     humanoid_bones,
     plain_shape,
 )
-from gsgan.motion.rotations import Array
+from gsgan.motion.rotations import Array, between
+from gsgan.motion.standard import known_joints
 from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
+logger = logging.getLogger(__name__)
 # glTF has y up, gsgan has z up.
 Z_UP = np.array(
     [
@@ -39,6 +43,7 @@ Z_UP = np.array(
         [0, 0, 0, 1],
     ]
 )
+USUAL = 1.7  # metres, the height of a person of an unknown unit
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
 UNIT_LENGTHS = (
     1.0,
@@ -48,6 +53,20 @@ UNIT_LENGTHS = (
 )  # metres per unit of a file, likeliest first
 # Required by a file, these would change the meshes and textures that are read here.
 UNSUPPORTED_LOOKS = ("KHR_draco_mesh_compression", "KHR_texture_basisu")
+# Beginnings of the names of extensions that are applied, or change only how light is reflected.
+KNOWN = (
+    "EXT_meshopt_compression",
+    "EXT_texture_webp",
+    "KHR_lights",
+    "KHR_materials_",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "VRM",
+)
+TRANSFORM = "KHR_texture_transform"
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+CHARACTER_FILES = (".glb", ".gltf", ".vrm")
+UPRIGHT = 0.7  # cosine between the way from hips to head and the vertical
 TRIANGLES = 4  # glTF's number of this primitive mode
 AVATAR_FILES = sorted(Path(__file__).with_name("avatars").glob("*.glb"))
 AVATARS = {path.stem: path for path in AVATAR_FILES}
@@ -75,7 +94,7 @@ def read_character(path: Path) -> Character:
             f"{path}: no such file; expected a rigged character as .glb"
         )
     try:
-        glb = GltfFile(path, (*UNSUPPORTED, *UNSUPPORTED_LOOKS))
+        glb = GltfFile(path, (*UNSUPPORTED, *UNSUPPORTED_LOOKS), KNOWN)
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
@@ -100,6 +119,8 @@ class _Skeleton:
         # Bones are the joints of all skins and the humanoid bones, parents first.
         node_names = [node.name for node in self.nodes]
         named = humanoid_bones(node_names, glb.doc.extensions or {})
+        if not set(REQUIRED_BONES) <= set(named.values()):
+            named = self._by_other_names() or named
         used = set(named)
         for skin in skins:
             used.update(skin.joints)
@@ -136,6 +157,34 @@ class _Skeleton:
             self._worlds[node] = above @ local_matrix(self.nodes[node])
         return self._worlds[node]
 
+    def _by_other_names(self) -> dict[int, str]:
+        """Node number → Mixamo's bone name, by the names that motions have; the bones between the
+        hips and the head are spine and neck."""
+        names = tuple(node.name or "" for node in self.nodes)
+        found = known_joints(names)
+        if not {"Hips", "Head"} <= set(found):
+            return {}
+        named = {node: bone for bone, node in found.items()}
+        trunk: list[int] = []
+        for node in self.glb.ancestors(found["Head"]):
+            if node == found["Hips"]:
+                break
+            trunk.insert(0, node)
+        if len(trunk) > 1:
+            named[trunk.pop()] = "Neck"
+        for node, bone in zip(
+            trunk, ("Spine", "Spine1", "Spine2"), strict=False
+        ):
+            named[node] = bone
+
+        # A bone between the spine and an arm is a collarbone.
+        for side in ("Left", "Right"):
+            arm = found.get(f"{side}Arm")
+            above = None if arm is None else self.glb.above.get(arm)
+            if above is not None and above not in named:
+                named[above] = f"{side}Shoulder"
+        return named
+
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
         """Canonical names of humanoid bones; other joints keep theirs, made unique."""
         names: list[str] = []
@@ -163,6 +212,7 @@ class _Part:
     bone_index: Ints  # [V, 4]
     bone_weight: Array  # [V, 4], sums to 1
     shapes: dict[str, Array]  # [V, 3] offsets by plain name
+    surface: Surface | None = None  # of its own, in place of the material
 
 
 class _Binding(NamedTuple):
@@ -213,14 +263,22 @@ def _part(
 
     # Texture coordinates, of the set that the base colour uses.
     base = _base_texture(glb, primitive.material)
-    uv_set = (base and base.texCoord) or 0
+    transform = (base and (base.extensions or {}).get(TRANSFORM)) or {}
+    uv_set = transform.get("texCoord", (base and base.texCoord) or 0)
     uv = np.zeros((len(position), 2))
     if f"TEXCOORD_{uv_set}" in attributes:
         uv = glb.accessor(attributes[f"TEXCOORD_{uv_set}"])
+    uv = _transformed_uv(uv, transform)
+
+    # Colours of vertices multiply the base colour.
+    colours = np.ones((len(position), 4))
+    if "COLOR_0" in attributes:
+        given = glb.accessor(attributes["COLOR_0"])
+        colours[:, : given.shape[1]] = given
 
     # Exporters store the names of shapes with the mesh or with the primitive.
     names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
-    return _Part(
+    part = _Part(
         name=f"{node.name} {mesh.name}",
         material=-1 if primitive.material is None else primitive.material,
         vertices=_transformed(linear, position) + binding.to_world[:, :3, 3],
@@ -230,6 +288,66 @@ def _part(
         bone_index=binding.bones,
         bone_weight=binding.weights,
         shapes=_shapes(glb, names, primitive.targets or (), linear),
+    )
+    return part if (colours == 1).all() else _painted(glb, part, colours)
+
+
+def _transformed_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
+    """Texture coordinates ``[V, 2]`` after KHR_texture_transform: scaled, turned, moved."""
+    scaled = uv * transform.get("scale", (1, 1))
+    angle = transform.get("rotation", 0.0)
+    c, s = np.cos(angle), np.sin(angle)
+    turned: Array = scaled @ np.array([[c, -s], [s, c]])
+    return turned + transform.get("offset", (0, 0))
+
+
+def _painted(glb: GltfFile, part: _Part, colours: Array) -> _Part:
+    """A part whose colours of vertices ``[V, 4]``, linear, are a texture: 2 x 2 pixels for each
+    face, in which colours go on beyond its third corner.
+
+    Raises:
+        DataError: when it has a texture too.
+    """
+    if part.material >= 0 and _base_texture(glb, part.material) is not None:
+        raise DataError(
+            f"{glb.path}: {part.name} has colours of vertices and a texture; bake the colours into "
+            "the texture"
+        )
+    plain = _surface(glb, part.material)
+    factor = plain.colour[0, 0] / 255
+    light = colours * [*linear(factor[:3]), factor[3]]
+
+    # The colours of the four pixels of each face, in a square of such blocks.
+    a, b, c = light[part.faces].transpose(1, 0, 2)
+    blocks = np.stack([a, b, c, b + c - a], axis=1).clip(0, 1)
+    F = len(part.faces)
+    side = int(np.ceil(np.sqrt(F)))
+    row, column = np.divmod(np.arange(F), side)
+    image = np.ones((2 * side, 2 * side, 4))
+    corners = ((0, 0), (0, 1), (1, 0), (1, 1))
+    for k, (down, right) in enumerate(corners):
+        image[2 * row + down, 2 * column + right] = blocks[:, k]
+    image[..., :3] = srgb(image[..., :3])
+    pixels = np.rint(255 * image).astype(np.uint8)
+    if plain.cutoff == 0:
+        pixels[..., 3] = 255
+
+    # Each face gets vertices of its own, at the centres of its pixels.
+    uv = np.empty((F, 3, 2))
+    for k, (down, right) in enumerate(corners[:3]):
+        uv[:, k, 0] = (2 * column + right + 0.5) / (2 * side)
+        uv[:, k, 1] = (2 * row + down + 0.5) / (2 * side)
+    at = part.faces.ravel()
+    return replace(
+        part,
+        surface=replace(plain, colour=pixels),
+        vertices=part.vertices[at],
+        normals=part.normals[at],
+        uv=uv.reshape(-1, 2),
+        faces=np.arange(3 * F).reshape(F, 3),
+        bone_index=part.bone_index[at],
+        bone_weight=part.bone_weight[at],
+        shapes={name: shape[at] for name, shape in part.shapes.items()},
     )
 
 
@@ -315,7 +433,12 @@ def _base_texture(glb: GltfFile, material: int | None) -> Any:
     """The base colour's texture info, None without a texture."""
     if material is None:
         return None
-    shader = glb.doc.materials[material].pbrMetallicRoughness
+    entry = glb.doc.materials[material]
+    glossy = (entry.extensions or {}).get(GLOSSY)
+    if glossy is not None:
+        texture = glossy.get("diffuseTexture")
+        return texture and TextureInfo(**texture)
+    shader = entry.pbrMetallicRoughness
     return shader and shader.baseColorTexture
 
 
@@ -330,9 +453,9 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     base = _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
     colour = glb.image(base.index) if base else white
-    factor = np.array(
-        (shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64
-    )
+    glossy = (entry.extensions or {}).get(GLOSSY, {})
+    given = glossy.get("diffuseFactor") or (shader and shader.baseColorFactor)
+    factor = np.array(given or (1, 1, 1, 1), np.float64)
     if (factor != 1).any():
         colour = _scaled(colour, factor)
 
@@ -346,6 +469,7 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     # Normal maps are optional.
     normal = None
     if entry.normalTexture is not None:
+        _refuse_other_transform(glb, entry.normalTexture, base)
         normal = glb.image(entry.normalTexture.index)[..., :3]
     return Surface(
         name=entry.name or "",
@@ -353,6 +477,17 @@ def _surface(glb: GltfFile, material: int) -> Surface:
         normal=normal,
         cutoff=cutoff,
     )
+
+
+def _refuse_other_transform(glb: GltfFile, normal: Any, base: Any) -> None:
+    """Refuses normals that lie elsewhere on the surface than colours: coordinates are shared."""
+    own = (normal.extensions or {}).get(TRANSFORM) or {}
+    shared = (base and (base.extensions or {}).get(TRANSFORM)) or {}
+    if base is not None and own != shared:
+        raise DataError(
+            f"{glb.path}: {TRANSFORM} of a normal map differs from that of the base colour; give "
+            "both the same, or export without"
+        )
 
 
 def _scaled(colour: Bytes, factor: Array) -> Bytes:
@@ -380,8 +515,21 @@ class _Standing(NamedTuple):
 
 def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
     """How to stand the person up, whose left side tells its heading."""
-    # Files face one of few directions: the heading is rounded to 5 degrees.
+    # A file without "+Y up" lies: the axis nearest to the way from hips to head is turned up.
     at = dict(zip(skeleton.bones, skeleton.joints, strict=True))
+    lying = np.eye(3)
+    upward = at["Head"] - at["Hips"]
+    if upward[2] < UPRIGHT * np.linalg.norm(upward):
+        axis = np.zeros(3)
+        nearest = int(np.abs(upward).argmax())
+        axis[nearest] = np.sign(upward[nearest])
+        lying = between(axis, np.array([0.0, 0, 1]))
+        if nearest == 2:  # upside down
+            lying = np.diag([1.0, -1.0, -1.0])
+        at = {bone: lying @ place for bone, place in at.items()}
+        vertices = vertices @ lying.T
+
+    # Files face one of few directions: the heading is rounded to 5 degrees.
     hips = at["LeftUpLeg"] - at["RightUpLeg"]
     arms = at["LeftArm"] - at["RightArm"]
     left = hips + arms
@@ -397,16 +545,24 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
     low, high = HEIGHTS
 
     # The unit that gives a plausible height, or else a usual one.
-    scale = 1.7 / height
+    scale = 0.0
     for unit in UNIT_LENGTHS:
         if low <= unit * height <= high:
             scale = unit
             break
+    if scale == 0:
+        scale = USUAL / height
+        logger.warning(
+            "%s: a height of %.3g fits no unit and is scaled to %.1f m",
+            skeleton.glb.path,
+            height,
+            USUAL,
+        )
 
     # The hips are over the origin, the lowest vertex is on the floor.
     origin = scale * turn @ (at["LeftUpLeg"] + at["RightUpLeg"]) / 2
     origin[2] = scale * vertices[:, 2].min()
-    return _Standing(turn, scale, origin)
+    return _Standing(turn @ lying, scale, origin)
 
 
 def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
@@ -455,8 +611,16 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
 
     # The material and the name of each face's part.
     counts = [len(part.faces) for part in parts]
-    materials = sorted({part.material for part in parts})
-    material = [materials.index(part.material) for part in parts]
+    plain = {part.material for part in parts if part.surface is None}
+    materials = sorted(plain)
+    surfaces = [_surface(glb, number) for number in materials]
+    material = []
+    for part in parts:
+        if part.surface is None:
+            material.append(materials.index(part.material))
+        else:
+            material.append(len(surfaces))
+            surfaces.append(part.surface)
     names = np.repeat([part.name for part in parts], counts)
 
     # Labels and landmarks need a character, so they are added afterwards.
@@ -469,7 +633,7 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
         material=np.repeat(material, counts),
         labels=np.ones(len(merged_faces), np.int64),
         label_names=LABEL_NAMES,
-        surfaces=tuple(_surface(glb, material) for material in materials),
+        surfaces=tuple(surfaces),
         bones=skeleton.bones,
         parents=skeleton.parents,
         joints=standing.points(skeleton.joints),

@@ -19,7 +19,7 @@ from gsgan.motion.character import Character
 from gsgan.motion.readers import RIGS
 from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
 from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.gltf import AVATARS, read_character
+from gsgan.synthetic.gltf import AVATARS, CHARACTER_FILES, read_character
 from gsgan.synthetic.passages import frame_times, held_out, split_signs
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
@@ -169,11 +169,14 @@ class SceneSettings:
         """The avatar and the motion are known names or files of a known format."""
         named = (*AVATARS, FREE_BODY)
         _require(
-            self.avatar in named or str(self.avatar).endswith(".glb"),
-            f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
+            self.avatar in named
+            or str(self.avatar).lower().endswith(CHARACTER_FILES),
+            f"avatar must be {', '.join(named)} or the path of a rigged "
+            f"{', '.join(CHARACTER_FILES)} file, got {self.avatar!r}",
         )
         _require(
-            self.motion in tuple(MOTIONS) or str(self.motion).endswith(RIGS),
+            self.motion in tuple(MOTIONS)
+            or str(self.motion).lower().endswith(RIGS),
             f"motion must be {', '.join(MOTIONS)} or the path of a {', '.join(RIGS)} file, "
             f"got {self.motion!r}",
         )

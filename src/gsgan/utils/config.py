@@ -23,7 +23,7 @@ from hydra.errors import (
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_method
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
@@ -46,6 +46,51 @@ GONE = {
     "effects.gaussians_per_pixel": "model.generator.refine=true or false chooses whether the "
     "generator has a last level",
 }
+# An element of a list on the command line: in quotes, or up to the next comma.
+ELEMENT = re.compile(r"""\s*('[^']*'|"[^"]*"|[^,]+?)\s*(?:,|$)""")
+SWEEPS = ("-m", "--multirun")
+
+# Keys of a dataset that are paths, and where a config holds a dataset.
+DATA_PATHS = ("root", "smpl", "source.avatar", "source.motion")
+DATA_AT = ("data", "other_capture")
+# Keys that are paths, or names that may be one, in any command: their values are text.
+PATHS = frozenset(
+    {
+        "background",
+        "calibration",
+        "callbacks.remote.dirpath",
+        "camera",
+        "capture",
+        "compare",
+        "data_root",
+        "data_smpl",
+        "distil",
+        "hydra.run.dir",
+        "hydra.sweep.dir",
+        "landmarks",
+        "lpips.path",
+        "masks",
+        "mediapipe.folder",
+        "mediapipe.python",
+        "method",
+        "motion",
+        "other_capture",
+        "out",
+        "path",
+        "predictions",
+        "predictions_pattern",
+        "report",
+        "run",
+        "runs",
+        "skeleton",
+        "smpl",
+        "source",
+        "training.perceptual.path",
+        "upload",
+        "verify",
+        *(f"{at}.{key}" for at in DATA_AT for key in DATA_PATHS),
+    }
+)
 
 
 def config_folder() -> Path:
@@ -102,6 +147,16 @@ def refuse_gone(keys: Collection[str]) -> None:
     for key, instead in GONE.items():
         if key in keys:
             raise ConfigError(f"there is no {key} any more: {instead}")
+
+
+def paths_as_text(config: DictConfig) -> None:
+    """Makes text of numbers that a config file has at the keys of paths, such as ``root: 377``."""
+    for key in PATHS:
+        value = OmegaConf.select(config, key)
+        if isinstance(value, (bool, int, float)):
+            OmegaConf.update(config, key, str(value))
+        elif isinstance(value, ListConfig):
+            OmegaConf.update(config, key, [str(path) for path in value])
 
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -212,6 +267,7 @@ def entry(
             refuse_words_for_truth(config, defaults_of(name))
             plain = OmegaConf.to_container(config, resolve=False)
             refuse_gone(dict(flat(plain)))
+            paths_as_text(config)
             (get_method(task) if isinstance(task, str) else task)(config)
         except KeyboardInterrupt:
             _print_error("interrupted")
@@ -238,8 +294,9 @@ def entry(
             _print_error(str(error))
             sys.exit(FAILED)
 
-        # Paths that Hydra's grammar cannot read as they are.
-        sys.argv[1:] = map(quoted, sys.argv[1:])
+        # Paths that Hydra's grammar cannot read as they are; commas part the values of a sweep.
+        sweep = any(option in sys.argv for option in SWEEPS)
+        sys.argv[1:] = [quoted(argument, sweep) for argument in sys.argv[1:]]
         command = hydra.main(
             version_base="1.3",
             config_path=str(config_folder()),
@@ -285,26 +342,83 @@ def _end(error: OSError) -> None:
     _print_error(message or f"{error.filename}: {error.strerror}")
 
 
-def quoted(argument: str) -> str:
-    """``key=value`` with the value in quotes if Hydra's grammar cannot read it as it is, such as a
-    path with brackets, blanks or a quote; and with the user's folder for a leading ``~/``, which a
-    shell does not expand there."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
+def quoted(argument: str, sweep: bool = False) -> str:
+    """``key=value`` in a form that Hydra's grammar reads as it was typed.
 
+    The value of a key of `PATHS`, or each element of a list ``[a,b]`` there, is text: it is put in
+    quotes if Hydra would read something else, such as a number. Other values are put in quotes
+    where Hydra could not read them at all. A shell does not expand ``~/`` there, so it is expanded
+    here.
+
+    Args:
+        argument: of the command line.
+        sweep: whether commas part the values of a sweep.
+    """
     # Options such as --help are no assignments.
     key, sign, value = argument.partition("=")
     if not sign or not ASSIGNED.fullmatch(key):
         return argument
-    if value.startswith("~/"):
-        value = str(Path(value).expanduser())
+    name = key.lstrip("+")
 
-    # The mark is one that the value does not contain, if there is one.
+    # A list of paths, each of them as typed.
+    if name in PATHS and value.startswith("[") and value.endswith("]"):
+        elements = ELEMENT.findall(value[1:-1])
+        return f"{key}=[{','.join(_as_text(path) for path in elements)}]"
+
+    # Hydra's own grammar reads keys of other kinds, sweeps, and a capture that is given by keys.
+    value = _expanded(value)
+    read = _read_by_hydra(f"{key}={value}")
+    keys = name == "other_capture" and value.startswith("{")
+    if read is not None and (
+        name not in PATHS or keys or (sweep and read.is_sweep_override())
+    ):
+        return f"{key}={value}"
+
+    # No value at all, or text.
+    if value == "null":
+        return argument
+    return f"{key}={_as_text(value)}"
+
+
+def _as_text(value: str) -> str:
+    """A value that Hydra reads as this text; one in quotes stays."""
+    # Quotes that enclose the whole value are Hydra's.
+    if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
+        return value
+
+    # Hydra may read the text as it is; backslashes mean more in a list.
+    value = _expanded(value)
+    read = _read_by_hydra(f"key={value}")
+    same = read is not None and not read.is_sweep_override()
+    if same and read.value() == value and "\\" not in value:
+        return value
+
+    # The mark is one that the value does not contain, if there is one. Backslashes before a mark
+    # would escape it.
+    mark = '"' if "'" in value and '"' not in value else "'"
+    value = re.sub(rf"(\\*)({mark}|$)", _escaped, value)
+    return mark + value + mark
+
+
+def _escaped(match: re.Match[str]) -> str:
+    """Backslashes and the quote behind them, or the text's end, for a text in quotes."""
+    backslashes, mark = match.groups()
+    return 2 * backslashes + (f"\\{mark}" if mark else "")
+
+
+def _expanded(value: str) -> str:
+    """The value with the user's folder for a leading ``~/``."""
+    return str(Path(value).expanduser()) if value.startswith("~/") else value
+
+
+def _read_by_hydra(argument: str) -> Any:
+    """Hydra's `Override` of an argument, or None if its grammar cannot read it."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     try:
-        OverridesParser.create().parse_override(f"{key}={value}")
+        return OverridesParser.create().parse_override(argument)
     except (HydraException, OmegaConfBaseException):
-        mark = '"' if "'" in value and '"' not in value else "'"
-        value = mark + value.replace(mark, f"\\{mark}") + mark
-    return f"{key}={value}"
+        return None
 
 
 def one_sentence(error: BaseException) -> str | None:

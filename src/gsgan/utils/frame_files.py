@@ -13,8 +13,7 @@ import numpy as np
 
 from gsgan.utils.errors import DataError
 
-# The last group of digits in a name.
-LAST_DIGITS = re.compile(r"([0-9]+)[^0-9]*$")
+DIGITS = re.compile(r"[0-9]+")
 # frame numbers beyond it are dates or damage
 LARGEST_FRAME = 10**9
 
@@ -74,7 +73,8 @@ def frame_files(
         root: the dataset.
         folder: relative to it; empty when it does not exist.
         suffixes: of the files to list, lower case.
-        number: frame number of a file's stem; by default the last group of digits.
+        number: frame number of a file's stem; by default the last group of digits that differs
+            between the files.
 
     Raises:
         DataError: when a name has no number, two names have the same, or a link leads out.
@@ -84,7 +84,7 @@ def frame_files(
     names = frozenset(own_entries(place, root) if place.is_dir() else ())
     # The index is cached without its folder, so this camera gets a copy with its own.
     try:
-        found = copy(_by_frame(names, suffixes, number or last_number))
+        found = copy(_by_frame(names, suffixes, number))
     except DataError as error:
         raise DataError(f"{place}: {error}") from None
     found.folder = folder
@@ -95,26 +95,31 @@ def frame_files(
 def _by_frame(
     names: frozenset[str],
     suffixes: tuple[str, ...],
-    number: Callable[[str], int | None],
+    number: Callable[[str], int | None] | None,
 ) -> FrameFiles:
     """The files with one of the suffixes, by the number that each stem gives."""
-    found = dict[int, str]()
+    # Hidden files, such as those that macOS makes of every copied file, do not count.
+    stems = dict[str, str]()
     for name in sorted(names):
-        # Hidden files, such as those that macOS makes of every copied file, do not count.
         stem, _, suffix = name.rpartition(".")
-        if f".{suffix.lower()}" not in suffixes or name.startswith("."):
-            continue
-        frame = number(stem)
+        if f".{suffix.lower()}" in suffixes and not name.startswith("."):
+            stems[name] = stem
 
-        # Every image needs a number of its own, by which it finds its mask.
+    # Every image needs a number of its own, by which it finds its mask.
+    number = number or counting(stems.values())
+    found = dict[int, str]()
+    for name, stem in stems.items():
+        frame = number(stem)
         if frame is None:
             raise DataError(
                 f"{name} has no frame number up to {LARGEST_FRAME} in its name; number the "
-                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012.{suffix}"
+                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012{Path(name).suffix}"
             )
         if frame in found:
             raise DataError(
-                f"frame {frame} is there twice, as {found[frame]} and {name}; keep one of them"
+                f"{found[frame]} and {name} are both frame {frame} by the last number that differs "
+                f"between the names; one number must count the frames, e.g. "
+                f"000012{Path(name).suffix}"
             )
         found[frame] = name
     return FrameFiles("", found)
@@ -146,11 +151,30 @@ def own_entries(folder: Path, root: Path) -> list[str]:
     return [entry.name for entry in entries]
 
 
+def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
+    """The function that gives the frame number of each of these stems.
+
+    It is the last group of digits that differs between the stems: ``frame0012_cam1``,
+    ``000012_0``. Names often have other numbers in front, such as a date.
+    """
+    groups = [DIGITS.findall(stem) for stem in stems]
+    place = -1
+    if len({len(group) for group in groups}) == 1:
+        for i, values in enumerate(zip(*groups, strict=True)):
+            if len(set(values)) > 1:
+                place = i
+
+    def number(stem: str) -> int | None:
+        found = DIGITS.findall(stem)
+        return frame_of(found[place]) if found else None
+
+    return number
+
+
 def last_number(stem: str) -> int | None:
     """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
-    # Names often have other numbers in front, such as a date.
-    found = LAST_DIGITS.search(stem)
-    return frame_of(found[1]) if found else None
+    found = DIGITS.findall(stem)
+    return frame_of(found[-1]) if found else None
 
 
 def frame_of(digits: str) -> int | None:

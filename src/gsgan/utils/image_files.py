@@ -4,6 +4,7 @@ Every function turns problems with a file into one `DataError` that names the fi
 """
 
 import contextlib
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,10 @@ from gsgan.utils.files import unreadable
 
 ORIENTATION = 0x0112  # of EXIF
 TURNED = range(2, 9)  # its values besides upright
+# Bytes: some writers append a few after the end mark.
+TAIL = 64
+# The end of each format by its first bytes.
+END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_END = b"\xff\xd9"
 JPEG_SCAN = b"\xff\xda"
@@ -204,3 +209,19 @@ def cut_off(data: bytes) -> bool:
     # A thumbnail in the header has an end marker too, so only those after the last scan count.
     scan = data.rfind(JPEG_SCAN)
     return scan < 0 or data.find(JPEG_END, scan) < 0
+
+
+def complete(path: Path) -> bool:
+    """Whether a PNG or JPEG has its end mark; True for other files, False when unreadable."""
+    try:
+        with path.open("rb") as stream:
+            # The first bytes tell the format, the last ones whether it is complete.
+            start = stream.read(4)
+            stream.seek(max(0, os.fstat(stream.fileno()).st_size - TAIL))
+            tail = stream.read()
+    except OSError:
+        return False
+    for first, end in END_MARKS.items():
+        if start.startswith(first):
+            return end in tail
+    return bool(start)

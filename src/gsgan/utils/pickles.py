@@ -9,6 +9,7 @@ import io
 import math
 import pickle
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,16 @@ from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
 
+# joblib compresses by zlib, and names its own classes near the start.
+ZLIB = (b"x\x01", b"x\x5e", b"x\x9c", b"x\xda")
+JOBLIB_HEAD = 4096  # bytes
+# What converts the first person of files that programs write with joblib.
+WHAM = "numpy.savez('{made}', **joblib.load('{given}')[0])"
+FOUR_D_HUMANS = (
+    "people = [image['smpl'][0] for image in joblib.load('{given}').values() if image['smpl']]; "
+    "numpy.savez('{made}', **{{key: numpy.stack([person[key] for person in people]) "
+    "for key in ('global_orient', 'body_pose', 'betas')}})"
+)
 LARGEST_ARRAY = 2**30  # bytes of one array, unpacked
 
 
@@ -234,7 +245,20 @@ def read_pickle(path: Path) -> Any:
         DataError: when the file is missing, damaged, or names a class that is not allowed.
     """
     with _as_data_error(path, "pickle"):
-        return _load(io.BytesIO(path.read_bytes()))
+        content = path.read_bytes()
+    head = content[:JOBLIB_HEAD]
+    if head[:2] in ZLIB:
+        with _as_data_error(path, "pickle"):
+            head = zlib.decompressobj().decompress(head, JOBLIB_HEAD)
+    if b"joblib.numpy_pickle" in head:
+        line = FOUR_D_HUMANS if b"global_orient" in head else WHAM
+        line = line.format(given=path.name, made=f"{path.stem}.npz")
+        raise DataError(
+            f"{path} was written by joblib, whose files can run code; nothing was run: if you "
+            f'trust it, convert it by python -c "import joblib, numpy; {line}"'
+        )
+    with _as_data_error(path, "pickle"):
+        return _load(io.BytesIO(content))
 
 
 def read_npy(path: Path) -> Any:

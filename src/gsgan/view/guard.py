@@ -1,6 +1,7 @@
 """Which requests the viewer's server answers: viser itself answers any web page."""
 
 import ipaddress
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +10,13 @@ from typing import Any
 from urllib.parse import urlsplit
 
 
-def refusal(host: str | None, origin: str | None, served: str) -> str | None:
+def refusal(
+    host: str | None,
+    origin: str | None,
+    served: str,
+    allowed: str | None = None,
+    forwarded: str | None = None,
+) -> str | None:
     """The reason why a request is refused, or None.
 
     A browser sends in ``Origin`` which page opens a connection, so other pages are
@@ -20,7 +27,18 @@ def refusal(host: str | None, origin: str | None, served: str) -> str | None:
     Args:
         host, origin: the request's headers.
         served: the option ``host``.
+        allowed: the option ``origin``: another address of the page, behind a proxy.
+        forwarded: the header ``X-Forwarded-Host``, the name by which a proxy was asked.
     """
+    # Behind a proxy the page would wait for a connection that is refused, so it is refused itself.
+    public = urlsplit(allowed or "").netloc.lower()
+    name = _first_name(forwarded)
+    if name and name != public and name != host:
+        return (
+            "the viewer is behind a proxy or port forwarding; start it with "
+            f"origin=https://{name}, the address in the browser"
+        )
+
     # A name that is no address must be known.
     name = urlsplit(f"//{host}").hostname or ""
     try:
@@ -30,21 +48,38 @@ def refusal(host: str | None, origin: str | None, served: str) -> str | None:
             "localhost",
             served.lower(),
             socket.gethostname().lower(),
+            urlsplit(allowed or "").hostname,
         ):
-            return "open the viewer by the address that it prints"
+            return (
+                "open the viewer by the address that it prints, or start it with "
+                f"host={name or '<name>'} if that is a name of this machine"
+            )
 
-    # The page has the address that it connects to.
-    if origin is not None and origin.partition("://")[2] != host:
-        return "only the viewer's own page may connect"
+    # The page has the address that it connects to, or the one of the option.
+    if origin is None or origin == (allowed or "").rstrip("/"):
+        return None
+    if origin.partition("://")[2] != host:
+        return (
+            "only the viewer's own page may connect; behind a proxy start it with "
+            "origin=<the address in the browser>"
+        )
     return None
 
 
+def _first_name(forwarded: str | None) -> str:
+    """The first name in ``X-Forwarded-Host``, which proxies append to; empty for none or an odd
+    one."""
+    name = (forwarded or "").partition(",")[0].strip().lower()
+    return name if re.fullmatch(r"[a-z0-9.:\[\]-]*", name) else "<name>"
+
+
 @contextmanager
-def guarded(served: str) -> Iterator[None]:
+def guarded(served: str, allowed: str | None = None) -> Iterator[None]:
     """A context in which viser starts servers that refuse requests with status 403, see `refusal`.
 
     Args:
         served: the option ``host``.
+        allowed: the option ``origin``.
     """
     from websockets.asyncio import server  # viser's
 
@@ -52,7 +87,8 @@ def guarded(served: str) -> Iterator[None]:
     def check(inner: Any, connection: Any, request: Any) -> Any:
         host = request.headers.get("Host")
         origin = request.headers.get("Origin")
-        why = refusal(host, origin, served)
+        forwarded = request.headers.get("X-Forwarded-Host")
+        why = refusal(host, origin, served, allowed, forwarded)
         if why is None:
             return inner(connection, request)
         return connection.respond(403, f"{why}\n")

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import logging
+import re
 import socket
 import threading
 from collections.abc import Callable
@@ -31,6 +32,15 @@ from gsgan.view.guard import guarded
 from gsgan.view.session import IDLE_SECONDS, Session, Show
 
 MEGABYTE = 1 << 20
+EVERYWHERE = (
+    "0.0.0.0",
+    "::",
+)  # hosts that stand for all addresses of this machine
+ELSEWHERE = (
+    "192.0.2.1",
+    9,
+)  # an address for documentation, and the port that discards
+ORIGIN = r"https?://[^/\s]+/?"
 MAX_UPLOADS = 8  # of a browser at the same time
 
 
@@ -45,7 +55,9 @@ def view_config(config: DictConfig) -> None:
     console = make_console()
     console.print(viewer.show.drive.text, markup=False, highlight=False)
     console.print(
-        f"open {viewer.address} in a browser; stop with Ctrl+C", highlight=False
+        f"open {' or '.join(viewer.addresses)} in a browser; stop with Ctrl+C",
+        highlight=False,
+        soft_wrap=True,
     )
     try:
         viewer.serve()
@@ -92,6 +104,13 @@ class Viewer:
             rate=float(above("rate", config.rate)),
         )
 
+        # The page's address behind a proxy.
+        origin = None if config.origin is None else str(config.origin)
+        if origin is not None and not re.fullmatch(ORIGIN, origin):
+            raise ConfigError(
+                f"origin must be the beginning of an address, such as https://name, got {origin!r}"
+            )
+
         # With an address of another machine, viser would never return.
         host = str(config.host)
         port = between("port", whole("port", config.port, 0), 0, 65535)
@@ -106,7 +125,7 @@ class Viewer:
         # The server without viser's own banner, and without its share button, which would put the
         # avatar on a public address.
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        with contextlib.redirect_stdout(io.StringIO()), guarded(host):
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host, origin):
             self.server = viser.ViserServer(
                 host, port, label="gsgan", verbose=False
             )
@@ -137,6 +156,15 @@ class Viewer:
         if ":" in host:  # IPv6
             host = f"[{host}]"
         return f"http://{host}:{self.server.get_port()}"
+
+    @property
+    def addresses(self) -> list[str]:
+        """The addresses to open in a browser, of which other machines can open the first."""
+        port = self.server.get_port()
+        if self.server.get_host() not in EVERYWHERE:
+            return [self.address]
+        own = [f"http://{name}:{port}" for name in network_addresses()]
+        return [*own, f"http://localhost:{port}"]
 
     def serve(self) -> None:
         """Waits until interrupted."""
@@ -191,6 +219,17 @@ class Viewer:
             if due > 0:
                 self._wake.wait(due)
                 self._wake.clear()
+
+
+def network_addresses() -> list[str]:
+    """The address of this machine by which others reach it; empty without a network."""
+    # Nothing is sent: the system chooses the interface that leads to other networks.
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(ELSEWHERE)
+            return [str(probe.getsockname()[0])]
+        except OSError:
+            return []
 
 
 def import_viser() -> Any:

@@ -15,9 +15,10 @@
                       (2,2,3) where some were seen: of the free body, by gsgan.fit
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,7 +45,7 @@ from gsgan.data.skeletons import (
     make_landmarks,
     whole_frame_ids,
 )
-from gsgan.data.validation import Thresholds
+from gsgan.data.validation import Thresholds, spans
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
@@ -55,6 +56,7 @@ from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json
 from gsgan.utils.frame_files import FrameFiles, frame_files
+from gsgan.utils.image_files import complete, read_header
 from gsgan.utils.pickles import read_arrays
 
 Content = TypeVar("Content")
@@ -64,8 +66,10 @@ HANDS_FILE = "hands3d.npz"
 FACE_FILE = "face3d.npz"
 POSES_FILE = "body_pose.npz"
 SHAPE = "body_shape.npz"
-# Endings of masks and labels: compression would damage them.
+# Endings of masks and labels: compression damages them, so masks of JPEG are the second choice.
 MASKS = (".png",)
+JPEG_MASKS = (".jpg", ".jpeg")
+MAX_FILES = 40  # damaged or missing files that are listed
 # The number of rotations in a pose, by kind of body.
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 SKELETON_LIMITS = Consistency(refused_below=0.2)
@@ -139,9 +143,7 @@ def _find(
 
     # Images, masks and labels.
     images = _index_images(root, cameras)
-    masks = {
-        name: frame_files(root, f"masks/{name}", MASKS) for name in cameras
-    }
+    masks = {name: _masks_of(root, name) for name in cameras}
     labels = {
         name: frame_files(root, f"labels/{name}", MASKS) for name in cameras
     }
@@ -193,10 +195,17 @@ def _find(
     )
 
 
-def capture_problems(root: Path, limits: Thresholds) -> list[str]:
+def capture_problems(
+    root: Path, limits: Thresholds, already: Sequence[str] = ()
+) -> list[str]:
     """Every reason why a capture cannot be read: each file is read although others are damaged.
 
     A file without which another one cannot be understood is replaced by its defaults.
+
+    Args:
+        root: the dataset.
+        limits: thresholds.
+        already: reasons that are known; the files that they name are not named again.
     """
     problems: list[str] = []
 
@@ -225,7 +234,9 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
             lambda: read_cameras(cameras_path, cameras_json, conventions)
         )
         if cameras is not None:
-            attempt(lambda: _index_images(root, cameras))
+            images = attempt(lambda: _index_images(root, cameras)) or {}
+            known = [*already, *problems]
+            problems += islice(_file_problems(root, images, known), MAX_FILES)
 
     # Landmarks and body poses.
     joints = SKELETONS["mediapipe33" if meta is None else meta.skeleton]
@@ -242,6 +253,56 @@ def capture_problems(root: Path, limits: Thresholds) -> list[str]:
     if meta is not None and (root / POSES_FILE).exists():
         attempt(lambda: _read_poses(root, meta, conventions))
     return problems
+
+
+def _masks_of(root: Path, camera: str) -> FrameFiles:
+    """The masks of a camera by frame: PNG files, else JPEG files."""
+    folder = f"masks/{camera}"
+    return frame_files(root, folder, MASKS) or frame_files(
+        root, folder, JPEG_MASKS
+    )
+
+
+def _file_problems(
+    root: Path, images: Mapping[str, FrameFiles], known: Sequence[str]
+) -> Iterator[str]:
+    """A sentence for each image without a mask, and each image or mask that cannot be read.
+
+    Files that the sentences ``known`` name already are left out.
+    """
+    everywhere = sorted({frame for files in images.values() for frame in files})
+    named = " ".join(known)
+    for camera, files in images.items():
+        try:
+            masks = _masks_of(root, camera)
+        except DataError as error:
+            yield str(error)
+            continue
+        lacking = [frame for frame in everywhere if frame not in files]
+        if lacking:
+            yield (
+                f"{root / files.folder} lacks {len(lacking)} of {len(everywhere)} frames: "
+                f"{spans(lacking)}"
+            )
+        for frame, path in files.items():
+            mask = masks.get(frame)
+            if mask is None:
+                mask = f"masks/{camera}/{frame:06d}.png"
+            for file in (root / path, root / mask):
+                problem = None if str(file) in named else _damage(file)
+                if problem is not None:
+                    yield problem
+
+
+def _damage(file: Path) -> str | None:
+    """Why an image or mask cannot be read, or None; no pixel is decoded."""
+    try:
+        read_header(file)
+    except DataError as error:
+        return str(error)
+    if not complete(file):
+        return f"{file} is cut off; copy or export it again"
+    return None
 
 
 def _read_meta(

@@ -11,7 +11,7 @@ from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import Consistency, check_consistency
 from gsgan.data.layout import Found, Layout, MaskIndex, assemble, dataset_folder
-from gsgan.data.pixels import MaskFile
+from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.proportions import axis_name
@@ -185,7 +185,8 @@ def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
 
 
 class _Masks(Mapping[int, tuple[MaskFile, ...]]):
-    """Files as masks, one per image, all of one rule; made when they are asked for."""
+    """Files as masks, one per image, made when they are asked for; JPEG files with alpha from 0 to
+    255 have the rule of JPEG masks."""
 
     def __init__(self, files: Mapping[int, str], rule: str) -> None:
         self.files = files
@@ -193,7 +194,10 @@ class _Masks(Mapping[int, tuple[MaskFile, ...]]):
 
     def __getitem__(self, frame: int) -> tuple[MaskFile, ...]:
         # Millions of tuples would take more memory than the paths.
-        return (MaskFile(self.rule, self.files[frame]),)
+        path = self.files[frame]
+        if self.rule == "grey" and path.lower().endswith((".jpg", ".jpeg")):
+            return (mask_file(path),)
+        return (MaskFile(self.rule, path),)
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.files)

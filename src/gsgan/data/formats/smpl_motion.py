@@ -190,7 +190,9 @@ def _parameter(
     # Files nest the numbers differently.
     values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
-        found = getattr(content[key], "shape", type(content[key]).__name__)
+        found = str(len(values))
+        if len(values) == 87:
+            found += " (SMPL-X with 6 numbers for each hand, which this reader does not know)"
         raise DataError(
             f"{where}: '{key}' must hold {expected} numbers, found {found}"
         )

@@ -101,11 +101,19 @@ def open_source(
 ) -> tuple[int, Iterator[tuple[int, Any]]]:
     """Number of images (0: unknown), and an iterator of (frame number, BGR image)."""
     if path.is_dir():
-        files = {
-            int(re.findall(r"[0-9]+", p.stem)[-1]): p
+        paths = [
+            p
             for p in path.iterdir()
             if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
-        }
+        ]
+        # The last group of digits that differs, as in gsgan.utils.frame_files.
+        groups = [re.findall(r"[0-9]+", p.stem) for p in paths]
+        place = -1
+        if len({len(group) for group in groups}) == 1:
+            for i, values in enumerate(zip(*groups, strict=True)):
+                if len(set(values)) > 1:
+                    place = i
+        files = {int(g[place]): p for g, p in zip(groups, paths, strict=True)}
         return len(files), (
             (frame, read_image(files[frame])) for frame in sorted(files)
         )

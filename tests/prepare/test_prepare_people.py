@@ -1,0 +1,97 @@
+"""Of several people in view, the same one is taken in all cameras."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_scenes import ring, seen
+from make import skeletons
+
+from gsgan.prepare.landmarks import Detections
+from gsgan.prepare.options import Inputs
+from gsgan.prepare.people import one_person
+from gsgan.prepare.run import with_detections
+from gsgan.prepare.sources import Recording
+from gsgan.skeleton.joints import ALL, BODY
+from gsgan.utils.errors import DataError
+
+FRAMES = 12
+
+
+def detected(cameras, people, first) -> dict[str, Detections]:
+    """Detections of ``people [P, F, 33, 3]``, that of number ``first [C, F]`` before the others;
+    he alone where it is -1 - number."""
+    result = {}
+    for c, camera in enumerate(cameras):
+        rows = []
+        for f in range(FRAMES):
+            row = []
+            for p in people:
+                uv = seen([camera], p=p[f : f + 1])[2][0, 0]
+                px = np.full((ALL, 2), np.nan)
+                px[:BODY] = uv
+                conf = np.zeros(ALL)
+                conf[:BODY] = 1.0
+                row.append((px, conf))
+            number = first[c, f]
+            alone = number < 0
+            front = row.pop(-1 - number if alone else number)
+            rows.append([front] if alone else [front, *row])
+        result[camera.name] = Detections(
+            frame_id=np.arange(FRAMES),
+            px=np.stack([row[0][0] for row in rows]),
+            conf=np.stack([row[0][1] for row in rows]),
+            people=rows,
+        )
+    return result
+
+
+def two_people() -> np.ndarray:
+    person = skeletons(FRAMES)
+    return np.stack([person, person[::-1] + np.array([0.9, 0.5, 0.0])])
+
+
+def test_the_same_person_is_taken_in_all_cameras():
+    cameras = ring()[:3]
+    people = two_people()
+    first = (np.random.default_rng(0).random((3, FRAMES)) < 0.3).astype(int)
+    first[0, 5] = -1  # camera 0 shows the person alone
+    first[1, 7] = -2  # camera 1 shows the other one alone
+    found, (note,) = one_person(detected(cameras, people, first), cameras, {})
+    assert "several people were detected in 12 of 12 frames" in note
+    for camera in cameras:
+        truth = seen([camera], p=people[0])[2][0]
+        px = found[camera.name].px[:, :BODY]
+        if camera is cameras[1]:
+            assert np.isnan(px[7]).all()
+            px[7] = truth[7]
+        np.testing.assert_allclose(px, truth)
+
+
+def test_one_person_is_left_alone():
+    cameras = ring()[:2]
+    first = np.full((2, FRAMES), -1)
+    given = detected(cameras, two_people(), first)
+    assert one_person(given, cameras, {}) == (given, [])
+
+
+def test_people_that_cannot_be_joined_are_named_and_not_the_calibration():
+    cameras = ring()[:3]
+    given = detected(cameras, two_people(), np.zeros((3, FRAMES), int))
+    wrong = [cameras[0]]
+    for camera, metres in zip(cameras[1:], (1.0, -1.0), strict=True):
+        wrong.append(replace(camera, t=camera.t + np.array([0, metres, 0])))
+    with pytest.raises(DataError, match="several people were detected in 12"):
+        one_person(given, wrong, {})
+
+
+def test_several_faces_that_mediapipe_counts_are_noted(tmp_path):
+    arrays = {"px": np.full((4, 33, 2), 20.0), "conf": np.ones((4, 33))}
+    path = tmp_path / "a.npz"
+    np.savez(path, frame_id=np.arange(4), faces=[1, 2, 2, 1], **arrays)
+    video = Recording("a", Path("a.mp4"), (8, 8), 30.0, {}, 4)
+    inputs = Inputs({"a": video}, None, (), (), 30.0)
+    inputs, _ = with_detections(inputs, {"a": path})
+    (note,) = inputs.notes
+    assert "a: several people were detected in 2 of 4 frames" in note
