@@ -7,16 +7,15 @@ import pytest
 from make import skeletons
 
 from gsgan.prepare.camera_array import CameraArray
-from gsgan.prepare.sides import (
-    EACH_GROUP,
-    LABEL_COST,
-    apply_flips,
-    find_flips,
-    sides_of_sequence,
-)
+from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.triangulate import robust
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.joints import FLIP_GROUPS
+from gsgan.skeleton.side_sequence import (
+    EACH_GROUP,
+    LABEL_COST,
+    sides_of_sequence,
+)
 
 MIRROR = list(MEDIAPIPE33.mirror)
 

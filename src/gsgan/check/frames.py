@@ -14,6 +14,13 @@ from gsgan.check.settings import Limits
 from gsgan.check.views import CheckedData, MaskView, grouped
 from gsgan.data.skeletons import bone_lengths
 from gsgan.data.validation import spans
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.joints import BODY, FLIP_GROUPS
+from gsgan.skeleton.side_sequence import (
+    EACH_GROUP,
+    LABEL_COST,
+    sides_of_sequence,
+)
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import Bool, Float, expect_array, nanmedian
 from gsgan.utils.pickles import read_arrays
@@ -34,6 +41,10 @@ JUMP_RATIO = 4.0
 LIMB_METRES = 0.06
 # Share of frames facing backwards, above which left and right of all of them are exchanged.
 MAX_BACKWARDS = 0.5
+# The names of landmarks count as those of this many cameras.
+SURE_LABELS = 2.0
+USUAL_RATE = 30.0  # frames per second of a capture that does not state it
+PARTS = ("head", "arms", "legs")  # of `FLIP_GROUPS`
 
 
 @dataclass(frozen=True)
@@ -120,6 +131,20 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     return found
 
 
+def exchanged_sides(subject: CheckedData) -> Bool:
+    """The groups ``[F, G]``, `FLIP_GROUPS`, whose left and right are exchanged for a time.
+
+    Exchanged throughout is another finding: a motion without any change of sides has none here.
+    """
+    names = tuple(subject.template.names[:BODY])
+    if names != MEDIAPIPE33.names:
+        return np.zeros((len(subject.frames), len(FLIP_GROUPS)), bool)
+    time = subject.frames / (subject.layout.meta.fps or USUAL_RATE)
+    labels = np.full((len(time), len(FLIP_GROUPS)), SURE_LABELS * LABEL_COST)
+    wrong = sides_of_sequence(subject.seen_p, labels, time, EACH_GROUP)
+    return wrong & ~wrong.all(0)
+
+
 def reprojection_errors(subject: CheckedData) -> Float:
     """Pixels ``[F, J]`` between projected joints and 2D detections, NaN if unknown.
 
@@ -199,6 +224,18 @@ def frame_findings(
             "and right are exchanged, or images were mirrored"
         )
         findings.append(Finding("error", "skeleton", text))
+
+    # Left and right exchanged for a time: an error with the frames of each part.
+    if not mirrored:
+        wrong = exchanged_sides(subject)
+        for part, flags in zip(PARTS, wrong.T, strict=True):
+            frames = subject.frames[flags].tolist()
+            if frames:
+                text = (
+                    f"left and right of the {part} are exchanged in {len(frames)} of {count} "
+                    f"frames: {shortened(frames)}; correct the landmarks, or leave these frames out"
+                )
+                findings.append(Finding("error", "skeleton", text))
 
     # A warning per kind, with the first frame's text.
     for kind, what in DOUBTS.items():

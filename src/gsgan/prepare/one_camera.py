@@ -37,7 +37,6 @@ from gsgan.prepare.one_view import (
     solve_view,
 )
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options
-from gsgan.prepare.sides import WHOLE_BODY, sides_of_sequence
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.sources import (
     MIN_DECODED,
@@ -59,6 +58,7 @@ from gsgan.skeleton.joints import (
     WRIST_JOINTS,
 )
 from gsgan.skeleton.proportions import degrees_seen
+from gsgan.skeleton.side_sequence import WHOLE_BODY, sides_of_sequence
 from gsgan.utils.arrays import Bool, Float, Ints, expect_array, nanmedian
 from gsgan.utils.pickles import read_arrays
 
