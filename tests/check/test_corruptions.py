@@ -176,8 +176,8 @@ def shrink(p):
     [
         (
             exchange,
-            "warning",
-            "nose or toes point backwards in 2 of 12 frames: 5-6",
+            "error",
+            "left and right of the arms are exchanged in 2 of 12 frames: 5-6",
         ),
         (exchange_throughout, "error", "left and right are exchanged"),
         (

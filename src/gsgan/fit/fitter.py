@@ -2,6 +2,7 @@
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,7 @@ from gsgan.body.skinned import carry, vertex_normals
 from gsgan.fit.frames import MaskedFrames, Silhouette, around
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.scene import BodyPose, Camera, Gaussians
+from gsgan.skeleton.joints import BODY
 from gsgan.splat import Accuracy, rasterise
 from gsgan.utils.checks import above, at_least, between, whole
 from gsgan.utils.errors import ConfigError
@@ -25,9 +27,7 @@ CONTROL_SPREAD = 1.5  # of the controls' influence, in distances between them
 # standard deviation of a Gaussian, as a share of the points' spacing
 SIGMA = 0.7
 OPACITY = 0.95
-# weight of landmarks of face and palm, whose definitions differ
-LOOSE_WEIGHT = 0.25
-LOOSE_LANDMARKS = (*range(11), *range(17, 23))
+LOOSE_WEIGHT = 0.25  # of landmarks that are less certain, see `Fit`
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 
 
@@ -53,6 +53,7 @@ class Fit:
     noise: float = 0.02
     landmarks: float = 0.02
     prior: float = 0.005
+    loose: Sequence[int] = (*range(11), *range(17, 23))
 
     # Learning rates, and the share of the sweeps in which they stay.
     angle_rate: float = 0.004
@@ -77,6 +78,8 @@ class Fit:
         above("fit.surface_rate", self.surface_rate)
         at_least("fit.prior", self.prior, 0)
         at_least("fit.landmarks", self.landmarks, 0)
+        for joint in self.loose:
+            between("fit.loose", joint, 0, BODY - 1)
         between("fit.hold", self.hold, 0, 1)
 
 
@@ -201,7 +204,7 @@ class Fitter:
 
         # weights of the landmarks, and an optimiser each for surface and poses
         self.weight = frames.visibility.clone()
-        self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE_WEIGHT
+        self.weight[:, list(settings.loose)] *= LOOSE_WEIGHT
         self.surface_optimiser = torch.optim.Adam(
             self.surface.parameters(), settings.surface_rate, BETAS
         )

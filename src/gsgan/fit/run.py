@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,13 @@ from gsgan.scene import BodyPose, cat
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.utils.console import make_console, progress, working
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import write_atomically, write_json, write_npz, writing
+from gsgan.utils.files import (
+    read_json,
+    write_atomically,
+    write_json,
+    write_npz,
+    writing,
+)
 from gsgan.utils.tensors import pick_device
 
 REPORT = "body_fit.json"
@@ -190,6 +196,33 @@ def fit_before_training(
             fit_body(seen, settings, device=device)
 
 
+def refuse_other_fit(
+    data: GsganData, settings: Fit, given: Sequence[str]
+) -> None:
+    """Refuses settings of a fit that the capture has already, made with other ones.
+
+    Args:
+        data: the capture.
+        settings: as requested.
+        given: the overrides of these settings on the command line.
+
+    Raises:
+        ConfigError: naming the command that fits again.
+    """
+    poses = data.layout.poses
+    if not given or poses is None or not poses.fitted:
+        return
+    root = data.layout.root
+    report = root / REPORT
+    made = read_json(report).get("settings") if report.is_file() else None
+    if made != asdict(settings):
+        raise ConfigError(
+            f"{' '.join(given)} changes nothing: {root} has a fit with other settings; python -m "
+            f"gsgan.fit data=capture data.root={root} overwrite=true {' '.join(given)} makes it "
+            "anew"
+        )
+
+
 def fit_body(
     data: GsganData,
     settings: Fit,
@@ -251,6 +284,7 @@ def fit_body(
         poses[True] = _solve_all(data, shape, console, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
     report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
+    report["settings"] = asdict(settings)
 
     # the files, and what they say
     write_json(folder / REPORT, report)

@@ -26,6 +26,10 @@ POSE_STEPS = 8  # of all poses
 # Frames that are solved at once, and those that two parts share: their motion is continuous.
 PART = 240
 SHARED = 12
+# A cut: joints move (median) by this many times the usual step, and by this many metres.
+CUT_RATIO = 4.0
+MIN_CUT = 0.15
+CUT_SECONDS = 10.0  # longer than any gap that a motion passes
 MIN_TRUNK = 2  # of shoulders and hips: a frame with fewer has no start
 
 
@@ -58,7 +62,8 @@ def solve_views(views: Views) -> Tensor:
     Keyframes determine the shape; then the frames are solved together, in parts. Frames that show
     too little of a trunk are NaN.
     """
-    # Frames that the poses can start from.
+    # The motion does not go on over a cut; frames that the poses can start from.
+    views = replace(views, time=with_cuts(views.p, views.time))
     seen = views.p.isfinite().all(-1)
     trunk = seen[:, [11, 12, 23, 24]].sum(1)
     shoulders = seen[:, [11, 12]].all(1)
@@ -81,6 +86,15 @@ def solve_views(views: Views) -> Tensor:
         new |= torch.arange(len(at)) >= SHARED // 2
         p[at[new]] = X[new]
     return p
+
+
+def with_cuts(p: Tensor, time: Tensor) -> Tensor:
+    """Times ``[F]`` with a long gap at each cut between joints ``[F, 33, 3]``; NaN = missing."""
+    step = p.diff(dim=0).norm(dim=-1).nanmedian(dim=1).values
+    usual = step.nanmedian()
+    cut = (step > CUT_RATIO * usual) & (step > MIN_CUT)
+    gaps = torch.cat([cut.new_zeros(1), cut]).to(time) * CUT_SECONDS
+    return time + gaps.cumsum(0)
 
 
 class ViewsProblem(BodyProblem):

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from gsgan.data.datamodule import GsganData
 from gsgan.model.body_points import DENSE, points_per_pixel
+from gsgan.skeleton import TEMPLATES
 from gsgan.splat import resolve_backend
 from gsgan.train.module import AvatarTraining
 from gsgan.utils.config import BFLOAT16_SINCE
@@ -69,6 +70,11 @@ def _data(data: GsganData) -> list[Row]:
             "data",
             f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
             f"{info.frames} frames; held out: {held_out}",
+        ),
+        (
+            "images",
+            f"{data.size or 'their own'} pixels (data.size); skeleton {info.skeleton} of "
+            f"{len(TEMPLATES[info.skeleton].names)} joints (data.skeleton)",
         ),
         ("cache of images", f"{megabytes:,.0f} MB{each} (data.cache_mb)"),
     ]

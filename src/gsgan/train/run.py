@@ -29,7 +29,7 @@ from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.page import refuse_unsuitable
 from gsgan.export.run import export_config
-from gsgan.fit.run import fit_before_training
+from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.metrics.lpips import build_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distilled
@@ -242,6 +242,10 @@ def build_training(
     console = console or Console(quiet=True)
     with working(console, "reading the data"):
         data = build_data(config)
+    if HydraConfig.initialized():
+        given = HydraConfig.get().overrides.task
+        of_fit = [word for word in given if word.startswith(("fit.", "fit="))]
+        refuse_other_fit(data, instantiate(config.fit), of_fit)
     if data.lacks_body and moves_with_body(config):
         fit_before_training(
             data, instantiate(config.fit), device_of(config.trainer)
