@@ -78,6 +78,7 @@ class Fit:
         above("fit.surface_rate", self.surface_rate)
         at_least("fit.prior", self.prior, 0)
         at_least("fit.landmarks", self.landmarks, 0)
+        object.__setattr__(self, "loose", list(self.loose))
         for joint in self.loose:
             between("fit.loose", joint, 0, BODY - 1)
         between("fit.hold", self.hold, 0, 1)
