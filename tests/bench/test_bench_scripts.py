@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import ROOT
+from omegaconf import OmegaConf
 
 from gsgan.utils.errors import GsganError
 
@@ -205,3 +206,30 @@ def test_a_two_alternative_test_counts_what_was_chosen(
     answers.write_text("1 left\n")
     with pytest.raises(SystemExit, match="1 left"):
         call("--answers", str(answers))
+
+
+@pytest.mark.slow
+def test_a_film_has_no_error_against_itself(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "path", [str(SCRIPTS), *sys.path])
+    door = runpy.run_path(str(SCRIPTS / "front_door.py"))
+    settings = {
+        "avatar": "polo",
+        "fps": 5,
+        "cameras": 2,
+        "size": 64,
+        "clips": [["choreography", 0.5, 2], ["far", 1.0, 2]],
+    }
+    film = door["Film"](OmegaConf.create(settings))
+    truth = tmp_path / "truth"
+    source = tmp_path / "source"
+    door["trace"](film, truth, tmp_path / "frames", 0, 1)
+    door["write_truth"](film, truth)
+    door["write_videos"](film, tmp_path / "frames", source)
+    assert len(list(source.glob("*.mp4"))) == 2
+    errors = door["landmark_errors"](truth, truth)
+    assert not any(errors["exchanged"].values())
+    assert errors["body"]["noise 90 %"] == 0
+    assert door["camera_errors"](truth, truth) < 1e-6
+    masks = door["mask_errors"](truth, truth)
+    assert masks["IoU"] == 1
+    assert masks["outline 90 %"] == 0

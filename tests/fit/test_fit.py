@@ -24,7 +24,7 @@ from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import ScoreOptions, make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.frames import MaskedFrames, rotated
-from gsgan.fit.run import fit_before_training, run_fit
+from gsgan.fit.run import fit_before_training, refuse_other_fit, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import moves_with_body
 from gsgan.scene import BodyPose
@@ -209,6 +209,22 @@ def test_a_fit_before_training_writes_poses_into_the_capture(
     data = GsganData(root, size=48)
     assert not data.lacks_body
     assert data.layout.poses.fitted
+
+
+def test_other_settings_of_a_fit_that_is_there_are_refused(
+    people, compose, tmp_path
+):
+    root = str(shutil.copytree(people, tmp_path / "plain"))
+    settings = instantiate(compose("fit", *QUICK, "fit.sweeps=1").fit)
+    data = GsganData(root, size=48)
+    refuse_other_fit(data, settings, ["fit.sweeps=1"])
+    fit_before_training(data, settings, torch.device("cpu"))
+    data = GsganData(root, size=48)
+    refuse_other_fit(data, settings, ["fit.sweeps=1"])
+    other = instantiate(compose("fit", *QUICK, "fit=refined").fit)
+    refuse_other_fit(data, other, [])
+    with pytest.raises(ConfigError, match=r"fit=refined changes nothing.*"):
+        refuse_other_fit(data, other, ["fit=refined"])
 
 
 def test_a_fit_before_training_reads_the_data_as_the_run_does(

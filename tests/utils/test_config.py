@@ -1,6 +1,7 @@
 """Configs compose, match their constructors key for key, and ablations differ by a line or two."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -106,6 +107,31 @@ def test_an_ablation_changes_what_it_says_and_nothing_else(
     assert {
         next(c for c in changed if key.startswith(c)) for key in found
     } == changed
+
+
+def test_a_capture_is_taken_with_all_that_it_has(compose, tmp_path):
+    def chosen(*more: str) -> tuple[str, int, str]:
+        config = compose(
+            "train", "data=capture", f"data.root={tmp_path}", *more
+        )
+        return config.data.skeleton, config.data.size, config.data.root
+
+    # Nothing is known of the folder: the reader says what is wrong.
+    assert chosen()[:2] == ("mediapipe33", 512)
+    cameras = {"a": {"size": [320, 240]}, "b": {"size": [200, 100]}}
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    assert chosen()[1] == 320
+    assert chosen("size=small")[1] == 128
+    (tmp_path / "cameras.json").write_text("[3]")
+    assert chosen()[1] == 512
+
+    (tmp_path / "face3d.npz").touch()
+    assert chosen()[0] == "mediapipe33"
+    (tmp_path / "hands3d.npz").touch()
+    assert chosen()[0] == "holistic"
+    (tmp_path / "face3d.npz").unlink()
+    assert chosen()[0] == "mediapipe33_hands"
+    assert chosen("data.skeleton=mediapipe33")[0] == "mediapipe33"
 
 
 def test_demo_is_what_train_does_by_default_but_for_the_images_scored(compose):
