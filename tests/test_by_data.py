@@ -3,7 +3,7 @@
 import pytest
 from hydra import compose, initialize_config_dir
 
-from gsgan.utils.config import config_folder
+from gsgan.utils.config import config_folder, if_gpu
 
 DATA = sorted(
     path.stem for path in (config_folder() / "data").glob("[!_]*.yaml")
@@ -11,27 +11,26 @@ DATA = sorted(
 
 
 @pytest.mark.parametrize("data", DATA)
-def test_large_captures_train_at_full_size_by_themselves(compose, data):
-    config = compose("train", f"data={data}")
-    large = data in ("thuman4", "zju_mocap", "avatarrex")
-    assert config.size.image == (512 if large or data == "synthetic" else 128)
-    default = data == "synthetic"
-    assert config.training.schedule.step_two == (
-        250_000 if large else 3800 if default else 3200
-    )
-    small = compose("train", f"data={data}", "size=small", "training=demo")
+def test_size_and_training_given_by_name_come_before_the_data(data):
+    small = compose_train(f"data={data}", "size=small", "training=demo")
     assert (small.size.image, small.training.schedule.step_two) == (128, 3200)
 
 
 # The groups that the data chooses, with nothing else on the command line.
 CHOICES = {
     "avatarrex": ("full", "long"),
-    "capture": ("small", "demo"),
+    "capture": if_gpu(("own", "long"), ("cpu_512", "cpu_512")),
     "easymocap": ("small", "demo"),
     "synthetic": ("cpu_512", "cpu_512"),
     "thuman4": ("full", "long"),
     "zju_mocap": ("full", "long"),
 }
+
+
+def compose_train(*overrides):
+    """The config of `gsgan.train`."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        return compose("train", list(overrides))
 
 
 def choices(*overrides):
