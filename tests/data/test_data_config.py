@@ -1,6 +1,5 @@
 """The config files of the data: what they build, and what they take from other groups."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +10,10 @@ from writers.avatarrex import write_avatarrex
 from writers.easymocap import write_easymocap
 from writers.thuman4 import write_thuman4
 
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
+CONF = config_folder()
 
 
 def conf(name: str, *overrides: str) -> Any:
