@@ -344,14 +344,15 @@ def _from_several(
     # The joints, and the clocks of the cameras.
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
+    solution = _solved(options, inputs, frames, uv, conf, alphas, console)
     return Solved(
         inputs=inputs,
         masks=masks,
         rooms=silhouettes.rooms,
         frames=frames,
-        solution=_solved(options, inputs, frames, uv, conf, alphas, console),
+        solution=solution,
         drift=unsteady_clocks(
-            CameraArray.of(inputs.cameras),
+            solution.cameras,
             uv[:, :, :BODY],
             conf[:, :, :BODY],
         ),

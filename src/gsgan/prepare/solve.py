@@ -251,14 +251,15 @@ def solve(
         of_body = values.reshape(conf.shape)[:, :, :BODY]
         stages_in_pixels[name] = of_body * to_pixels
 
-    # Clocks by the given cameras: late ones would bend the refined cameras.
+    # Clocks by the cameras that silhouettes have chosen: wrong ones look like late clocks.
+    chosen = CameraArray(given.K, cameras.R, cameras.t)
     delay, gain = clock_errors(
-        given,
+        chosen,
         uv[:, :, :BODY],
         np.where(conf > settings.min_confidence, conf, 0.0)[:, :, :BODY],
     )
     return Solution(
-        cameras=CameraArray(given.K, cameras.R, cameras.t),
+        cameras=chosen,
         p=p,
         conf=np.where(seen & known(p), conf_seen, inferred),
         seen=seen,
