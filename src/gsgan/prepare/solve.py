@@ -56,7 +56,6 @@ MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
 BETTER = 0.9
 INFERRED = 0.1  # confidence of a joint that no two cameras see, but a body has
 SHOULDERS = [11, 12]
-LAG = 6  # frames by which clocks are compared, either way
 
 
 def match_hands(
@@ -291,8 +290,8 @@ def refine(
     """The given cameras, or refined ones where silhouettes show that these are better.
 
     A given calibration is evidence: detectors are wrong in the same direction in thousands of
-    landmarks, which fit best if cameras move. Cameras are refined by frontier points, and by
-    landmarks with little weight, in every other frame; the frames between decide.
+    landmarks, which fit best if cameras move. Cameras are refined by frontier points and landmarks
+    of every other frame, with each of `LANDMARK_WEIGHTS`; the frames between decide.
 
     Args:
         given: ``C`` cameras.
