@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from textwrap import fill
+from textwrap import fill, shorten
 from typing import Any
 
 import pandas as pd
@@ -166,7 +166,7 @@ def _by_case(rows: pd.DataFrame) -> dict[str, str]:
         "value error": number(rows.value_error.max(), 2),
         "gradient error": number(rows.gradient_error.max(), 2),
         "status": ", ".join([first.status, *named]),
-        "note": first.note,
+        "note": shorten(first.note, width=90, placeholder=" …"),
     }
 
 
