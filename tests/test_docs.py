@@ -64,7 +64,7 @@ def test_pages_named_in_the_code_exist():
 @pytest.mark.parametrize("page", RESULTS, ids=names(RESULTS))
 def test_results_name_commit_machine_and_date(page):
     text = page.read_text()
-    assert re.search(r"[Cc]ommits?[: ]", text), "no commit (or: not recorded)"
+    assert re.search(r"[Cc]ommits?[:\s]", text), "no commit (or: not recorded)"
     assert re.search(r"[Mm]achine|\(cpu\)|\(cuda\)", text), (
         "no machine (or: not recorded)"
     )
