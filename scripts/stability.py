@@ -126,7 +126,7 @@ def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
             width=100,
             break_on_hyphens=False,
         ),
-        "```bash\nmake stability ARGS=\"--page docs/results/stability.md\"\n```",
+        '```bash\nmake stability ARGS="--page docs/results/stability.md"\n```',
         "Float32 against float64, the worst of all backends; errors are those of cases that are "
         "right.\n`outputs/bench/stability` has a row for every case.\n"
         "[What a status means](../rasteriser.md#hard-cases).",
@@ -149,7 +149,9 @@ def _by_subject(
         "subject": f"{subject[:1].upper()}{subject[1:]}",
         "cases": str(count),
         "right": str(len(right)),
-        "value error": number(None if rows is None else rows.value_error.max(), 2),
+        "value error": number(
+            None if rows is None else rows.value_error.max(), 2
+        ),
         "gradient error": number(
             None if rows is None else rows.gradient_error.max(), 2
         ),

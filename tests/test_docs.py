@@ -167,18 +167,14 @@ def sentences(text: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize(
-    "page", PROSE + RESULTS, ids=names(PROSE + RESULTS)
-)
+@pytest.mark.parametrize("page", PROSE + RESULTS, ids=names(PROSE + RESULTS))
 def test_sentences_have_at_most_40_words(page):
     for sentence in sentences(page.read_text()):
         count = len(re.findall(r"\S*\w\S*", sentence))
         assert count <= 40, sentence
 
 
-@pytest.mark.parametrize(
-    "page", PROSE + RESULTS, ids=names(PROSE + RESULTS)
-)
+@pytest.mark.parametrize("page", PROSE + RESULTS, ids=names(PROSE + RESULTS))
 def test_text_is_wrapped_at_100_columns(page):
     for line in prose_lines(page.read_text()):
         assert len(line) <= 100 or " " not in line.strip(), line
