@@ -12,7 +12,7 @@ import numpy as np
 from gsgan.data.cameras import CameraEntry
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
-from gsgan.utils.frame_files import frame_files, natural_order
+from gsgan.utils.frame_files import entries, frame_files, natural_order
 from gsgan.utils.image_files import read_colour, read_header
 
 VIDEO_SUFFIXES = (
@@ -109,10 +109,9 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
     """The recordings in a folder by name; other files do not count."""
     sources: dict[str, Recording] = {}
-    for path in sorted(
-        folder.iterdir(), key=lambda path: natural_order(path.name)
-    ):
-        if path.name.startswith("."):
+    for name in sorted(entries(folder), key=natural_order):
+        path = folder / name
+        if name.startswith("."):
             continue
 
         # A folder of images, or a video.
