@@ -205,8 +205,8 @@ def of_entry(
     if crop is not None:
         joints = p.reshape(-1, 3)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
-        dist = entry.dist if lens and entry.keeps_lens else None
-        window = crop.window(entry, joints, known, dist)
+        kept = lens and entry.keeps_lens
+        window = crop.window(entry, joints, known, lens=kept)
     return entry.seen(window, (size, size), lens=lens)
 
 
