@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from make import skeletons
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.options import Inputs
 from gsgan.prepare.people import one_person
-from gsgan.prepare.run import with_detections
+from gsgan.prepare.run import with_detections, with_one_person
 from gsgan.prepare.sources import Recording
 from gsgan.skeleton.joints import ALL, BODY
 from gsgan.utils.errors import DataError
@@ -84,6 +85,16 @@ def test_people_that_cannot_be_joined_are_named_and_not_the_calibration():
         wrong.append(replace(camera, t=camera.t + np.array([0, metres, 0])))
     with pytest.raises(DataError, match="several people were detected in 12"):
         one_person(given, wrong, {})
+
+
+def test_several_people_are_named_before_cameras_are_found():
+    cameras = ring()[:3]
+    given = detected(cameras, two_people(), np.zeros((3, FRAMES), int))
+    options = SimpleNamespace(calibration="person", offsets=None)
+    inputs = Inputs({}, None, cameras, (), 30.0)
+    inputs, chosen = with_one_person(options, inputs, given)
+    assert "several people were detected in 12 frames" in inputs.notes[-1]
+    assert chosen is given
 
 
 def test_several_faces_that_mediapipe_counts_are_noted(tmp_path):
