@@ -97,6 +97,20 @@ def test_several_people_are_named_before_cameras_are_found():
     assert chosen is given
 
 
+def test_landmarks_numbered_from_another_start_are_noted(tmp_path):
+    path = tmp_path / "a.npz"
+    points = {"px": np.full((4, 33, 2), 20.0), "conf": np.ones((4, 33))}
+    np.savez(path, frame_id=np.arange(1, 5), **points)
+    for files in ({}, dict.fromkeys(range(4), path)):
+        video = Recording("a", Path("a.mp4"), (8, 8), 30.0, files, 4)
+        inputs = Inputs({"a": video}, None, (), (), 30.0)
+        inputs, _ = with_detections(inputs, {"a": path})
+        assert (
+            "a: images are numbered from 0, its landmarks from 1"
+            in (inputs.notes[0])
+        )
+
+
 def test_several_faces_that_mediapipe_counts_are_noted(tmp_path):
     arrays = {"px": np.full((4, 33, 2), 20.0), "conf": np.ones((4, 33))}
     path = tmp_path / "a.npz"

@@ -24,7 +24,7 @@ from gsgan.data.validation import (
     frames_of,
 )
 from gsgan.utils.errors import DataError, explained
-from gsgan.utils.frame_files import FrameFiles, entries
+from gsgan.utils.frame_files import FrameFiles, entries, shifted_numbers
 
 # Masks by camera and frame.
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
@@ -178,24 +178,6 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     return folder
 
 
-def _shifted_numbers(found: Found) -> list[str]:
-    """Notes on masks and landmarks whose numbers are those of the images but for their start."""
-    images = frames_of(found.images)
-    masks = sorted({frame for files in found.masks.values() for frame in files})
-    others = {"masks": masks, "landmarks": sorted(found.landmarks.p)}
-    notes = []
-    for what, numbers in others.items():
-        if len(numbers) != len(images) or numbers == images:
-            continue
-        first, other = images[0], numbers[0]
-        if [frame - first for frame in images] == [n - other for n in numbers]:
-            notes.append(
-                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
-                "alike, or every image gets what belongs to another moment"
-            )
-    return notes
-
-
 def assemble(found: Found, limits: Thresholds) -> Layout:
     """Checks the files against each other and leaves out those that cannot be used.
 
@@ -207,7 +189,9 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     cameras = found.cameras
     landmarks = found.landmarks
     calibration = found.calibration
-    shifted = _shifted_numbers(found)
+    masks = {frame for files in found.masks.values() for frame in files}
+    others = {"masks": masks, "landmarks": landmarks.p}
+    shifted = shifted_numbers(frames_of(found.images), others)
     notes = [*found.notes, *shifted]
     cause = None
     if shifted:

@@ -1,7 +1,7 @@
 """`gsgan.prepare`: videos in, a capture for `data=capture` out."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,6 +57,7 @@ from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
 from gsgan.utils.errors import DataError, explained
 from gsgan.utils.files import read_json, write_json
+from gsgan.utils.frame_files import shifted_numbers
 from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
@@ -340,6 +341,7 @@ def _from_several(
 ) -> Solved:
     """Several cameras: detections of one person, cameras in metres, joints in 3D."""
     found, masks = find_people(options, inputs.sources, stages, console.print)
+    inputs = _with_shifts(inputs, "masks", masks)
     inputs, masks = _with_times(options, inputs, masks, stages)
     inputs, detections = with_detections(inputs, found)
     inputs, detections = with_one_person(options, inputs, detections)
@@ -372,6 +374,24 @@ def _from_several(
     )
 
 
+def _with_shifts(
+    inputs: Inputs, what: str, numbers: Mapping[str, Iterable[int]]
+) -> Inputs:
+    """The inputs with notes on cameras whose files are numbered from another start than images.
+
+    Args:
+        inputs: the cameras.
+        what: the files.
+        numbers: of the files, by camera, counted as each camera's own images.
+    """
+    notes = [*inputs.notes]
+    for name, source in inputs.sources.items():
+        others = {f"its {what}": numbers[name]}
+        for note in shifted_numbers(source.numbers(), others):
+            notes.append(note.replace("doubtful: ", f"doubtful: {name}: "))
+    return replace(inputs, notes=notes)
+
+
 def with_detections(
     inputs: Inputs, found: Mapping[str, Path]
 ) -> tuple[Inputs, dict[str, Detections]]:
@@ -383,8 +403,10 @@ def with_detections(
     """
     notes = [*inputs.notes]
     detections = {}
+    numbers = {}
     for name in inputs.sources:
         read = landmarks.read_detections(found[name])
+        numbers[name] = read.frame_id.tolist()
         detections[name] = in_common(read, inputs.sources[name])
         for note in read.notes:
             notes.append(f"{name}: {note}")
@@ -398,7 +420,8 @@ def with_detections(
                     f"doubtful: {name}: several people were detected in {several} of {len(faces)} "
                     "frames; give landmarks and masks of one person if they are mixed up"
                 )
-    return replace(inputs, notes=notes), detections
+    noted = replace(inputs, notes=notes)
+    return _with_shifts(noted, "landmarks", numbers), detections
 
 
 def in_common(found: Detections, source: Recording) -> Detections:

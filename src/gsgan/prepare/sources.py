@@ -1,7 +1,7 @@
 """The recordings: one video or one folder of images per camera, and which camera took which."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -69,6 +69,10 @@ class Recording:
         for number, path in self.files.items():
             image = cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR)
             yield number, np.asarray(image, np.uint8)
+
+    def numbers(self) -> Iterable[int]:
+        """The images' own numbers; those of a video by its header, or none."""
+        return self.files or range(self.count or 0)
 
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""

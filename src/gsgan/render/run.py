@@ -110,9 +110,10 @@ def _output(config: DictConfig) -> Output:
             "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
         )
 
-    # Every other ending is most likely a mistake.
+    # Every other ending is most likely a mistake; a number is none.
     out = Path(config.out).expanduser()
-    if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
+    usual = out.suffix.lower() in ("", ".mp4") or out.suffix[1:].isdecimal()
+    if not usual and not out.is_dir():
         raise ConfigError(
             f"out={out} must be a .mp4 file, or a folder for PNG files"
         )

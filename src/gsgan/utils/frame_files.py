@@ -149,6 +149,30 @@ def entries(folder: Path) -> list[str]:
     return names
 
 
+def shifted_numbers(
+    images: Iterable[int], others: Mapping[str, Iterable[int]]
+) -> list[str]:
+    """Notes on files whose numbers are those of the images but for their start.
+
+    Args:
+        images: their frame numbers.
+        others: those of other files, by what they are.
+    """
+    given = sorted(images)
+    notes = []
+    for what, numbers in others.items():
+        found = sorted(numbers)
+        if len(found) != len(given) or found == given:
+            continue
+        first, other = given[0], found[0]
+        if [frame - first for frame in given] == [n - other for n in found]:
+            notes.append(
+                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
+                "alike, or every image gets what belongs to another moment"
+            )
+    return notes
+
+
 def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
     """The function that gives the frame number of each of these stems.
 
