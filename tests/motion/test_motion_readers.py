@@ -963,6 +963,9 @@ def test_relatives_of_smpl_are_the_same_motion(tmp_path, shared, proportions):
             directions(found), directions(truth), atol=1e-6, err_msg=name
         )
 
+    with pytest.raises(DataError, match=r"one frame .* motion=.*fits$"):
+        standard(fits / "000000.json", proportions, smpl=model)
+
     # AMASS' 52 joints with SMPL-H's model.
     smpl_h(tmp_path / "SMPLH.npz", smpl_arrays("smpl"))
     wide = np.zeros((5, 156))

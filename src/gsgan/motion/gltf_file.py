@@ -142,9 +142,10 @@ class GltfFile:
         return values.astype(np.float64)
 
     def decompress(self, primitive: Any) -> None:
-        """Decodes the arrays of a primitive, if KHR_draco_mesh_compression packs them."""
+        """Decodes the arrays of a primitive, if KHR_draco_mesh_compression alone holds them."""
         packed = (primitive.extensions or {}).get(DRACO)
-        if packed is None:
+        positions = self.doc.accessors[primitive.attributes.POSITION]
+        if packed is None or positions.bufferView is not None:
             return
         try:
             import DracoPy

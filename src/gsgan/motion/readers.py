@@ -240,12 +240,7 @@ def read_fits(folder: Path, source: Source) -> Clip:
     smallest id."""
     frames: dict[str, list[Any]] = {key: [] for key in FIT_KEYS}
     for path in json_files(folder).values():
-        content = read_json_value(path)
-        if isinstance(content, dict):
-            content = content.get("annots")
-        people = content if isinstance(content, list) else []
-        fits = [one for one in people if isinstance(one, dict)]
-        fits = [one for one in fits if set(FIT_KEYS) <= one.keys()]
+        fits = _fits(read_json_value(path))
         if not fits:
             raise DataError(
                 f"{path}: expected a fit of EasyMocap with {', '.join(FIT_KEYS)}"
@@ -259,6 +254,15 @@ def read_fits(folder: Path, source: Source) -> Clip:
             raise DataError(f"{folder}: {key!r} differs in length by frame")
         arrays[key] = np.stack(rows)
     return _by_names(folder, arrays, source)
+
+
+def _fits(content: Any) -> list[dict[str, Any]]:
+    """EasyMocap's fits of the people of one frame, in a file's content; empty for other content."""
+    if isinstance(content, dict):
+        content = content.get("annots")
+    people = content if isinstance(content, list) else []
+    people = [one for one in people if isinstance(one, dict)]
+    return [one for one in people if set(FIT_KEYS) <= one.keys()]
 
 
 def read_tensors(path: Path, source: Source) -> Clip:
@@ -651,6 +655,10 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     """
     # The list of frames is the whole file, or one entry of it.
     content = read_json_value(path)
+    if _fits(content):
+        raise DataError(
+            f"{path} is one frame of EasyMocap's fits; give their folder, motion={path.parent}"
+        )
     frames = content
     fps = None
     if isinstance(content, dict):
