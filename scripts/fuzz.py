@@ -417,6 +417,8 @@ def page(table: dict[str, Counter[str]], seconds: float) -> str:
     commit = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
+    total = sum(table.values(), Counter())
+    shown = [name for name in OUTCOMES if name in GOOD or total[name]]
     lines = [
         "# Damaged files",
         "",
@@ -424,14 +426,15 @@ def page(table: dict[str, Counter[str]], seconds: float) -> str:
         f"{time.strftime('%Y-%m-%d')}, {seconds / 60:.0f} minutes.",
         "",
         f"Reads of damaged and hostile files, each with {MEMORY >> 30} GB of memory and {SECONDS} "
-        "seconds of processor time, by outcome: read, refused with one sentence, ended with a "
-        "traceback, out of memory or time, killed, or did what no reader may do.",
+        "seconds of processor time.\nPossible outcomes are: read, refused with one sentence, "
+        "ended with a traceback, out of memory\nor time, killed, and code that no reader may run. "
+        "Those that occurred:",
         "",
-        "| kind | files | " + " | ".join(OUTCOMES) + " |",
-        "|---" * (len(OUTCOMES) + 2) + "|",
+        "| kind | files | " + " | ".join(shown) + " |",
+        "|---" * (len(shown) + 2) + "|",
     ]
-    for kind, found in {**table, "all": sum(table.values(), Counter())}.items():
-        counts = " | ".join(str(found[name]) for name in OUTCOMES)
+    for kind, found in {**table, "all": total}.items():
+        counts = " | ".join(str(found[name]) for name in shown)
         lines.append(f"| {kind} | {sum(found.values())} | {counts} |")
     return "\n".join(lines) + "\n"
 

@@ -3,7 +3,8 @@
     python scripts/stability.py [--page docs/results/stability.md] [--out folder] [--device cuda]
 
 Prints a table, writes ``stability.md``, ``.csv`` and ``.json`` into a folder, and a page of the
-docs with one line per case. Ends with an error when a case gets another status than expected.
+docs with a line per subject and those cases that are not right. Ends with an error when a case
+gets another status than expected.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill, shorten
 from typing import Any
 
 import pandas as pd
@@ -97,7 +99,7 @@ def table(frame: pd.DataFrame) -> str:
 
 
 def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
-    """One line per case, the worst of its backends, a table per subject; Markdown."""
+    """A row per subject, and a line per case that is not right on every backend; Markdown."""
     describe = [
         "git",
         "describe",
@@ -108,35 +110,65 @@ def whole_page(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
     commit = subprocess.run(
         describe, cwd=ROOT, check=False, capture_output=True, text=True
     ).stdout
+    subjects, others = [], []
+    for subject, rows in frame.groupby("subject", sort=False):
+        cases = [case for _, case in rows.groupby("case", sort=False)]
+        right = [case for case in cases if (case.status == "right").all()]
+        subjects.append(_by_subject(subject, len(cases), right))
+        others += [
+            _by_case(case) for case in cases if (case.status != "right").any()
+        ]
+
     parts = [
         "# Results: numerically hard cases",
-        f"Commit: {commit.strip() or 'not recorded'}; machine and date: {sentence(where)}. "
-        'Written by `make stability ARGS="--page docs/results/stability.md"`; '
-        "[what it means](../rasteriser.md#hard-cases).",
+        fill(
+            f"Commit: {commit.strip() or 'not recorded'}; machine and date: {sentence(where)}.",
+            width=100,
+            break_on_hyphens=False,
+        ),
+        '```bash\nmake stability ARGS="--page docs/results/stability.md"\n```',
+        "Float32 against float64, the worst of all backends; errors are those of cases that are "
+        "right.\n`outputs/bench/stability` has a row for every case.\n"
+        "[What a status means](../rasteriser.md#hard-cases).",
+        markdown(pd.DataFrame(subjects)),
     ]
-    for subject, cases in frame.groupby("subject", sort=False):
-        lines = [
-            _by_case(name, rows)
-            for name, rows in cases.groupby("case", sort=False)
-        ]
+    if others:
         parts += [
-            f"## {subject[:1].upper()}{subject[1:]}",
-            markdown(pd.DataFrame(lines)),
+            "## Cases with another status",
+            markdown(pd.DataFrame(others)),
         ]
     return "\n\n".join(parts) + "\n"
 
 
-def _by_case(name: str, rows: pd.DataFrame) -> dict[str, str]:
+def _by_subject(
+    subject: str, count: int, right: Sequence[pd.DataFrame]
+) -> dict[str, str]:
+    """The number of cases of a subject, and the largest errors of those that are right."""
+    rows = pd.concat(right) if right else None
+    return {
+        "subject": f"{subject[:1].upper()}{subject[1:]}",
+        "cases": str(count),
+        "right": str(len(right)),
+        "value error": number(
+            None if rows is None else rows.value_error.max(), 2
+        ),
+        "gradient error": number(
+            None if rows is None else rows.gradient_error.max(), 2
+        ),
+    }
+
+
+def _by_case(rows: pd.DataFrame) -> dict[str, str]:
     """One case on all its backends; those with another status than the first are named."""
     first = rows.iloc[0]
     others = rows[rows.status != first.status]
     named = [f"{row.backend}: {row.status}" for row in others.itertuples()]
     return {
-        "case": name,
+        "case": first.case,
         "value error": number(rows.value_error.max(), 2),
         "gradient error": number(rows.gradient_error.max(), 2),
         "status": ", ".join([first.status, *named]),
-        "note": first.note,
+        "note": shorten(first.note, width=90, placeholder=" …"),
     }
 
 

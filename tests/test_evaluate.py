@@ -168,6 +168,20 @@ def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
                 assert sum(own) / len(own) == pytest.approx(expected, abs=1e-9)
 
 
+def test_poses_are_aligned_on_the_images_that_are_scored(run, inside, tmp_path):
+    own = shutil.copytree(run, tmp_path / "run")
+    result = inside(
+        "evaluate", f"run={own}", "align=pose", "splits=[novel_pose]"
+    )
+    assert result.returncode == 0, result.stderr
+    aligned = scores(own / "aligned" / "novel_pose")["novel_pose"]["full"]
+    assert "body poses aligned on the scored images" in aligned["marks"]
+
+    # An avatar that is trained this short has an outline, and the pose follows it.
+    as_given = scores(own)["novel_pose"]["full"]
+    assert aligned["psnr"] > as_given["psnr"]
+
+
 def test_a_run_is_scored_on_another_capture_against_the_distance_from_training(
     run, capture, inside, tmp_path
 ):
@@ -396,6 +410,7 @@ def test_arguments_that_do_not_fit_together_are_refused(
             ("drive= cannot be given with predictions=",),
         ),
         ([f"run={run}", "drive=body"], ("drive must be skeleton or null",)),
+        ([f"run={run}", "align=image"], ("align must be pose or null",)),
         (
             [here, *given, "splits=[]"],
             ("splits must be a list of novel_view and novel_pose",),

@@ -229,12 +229,11 @@ def failures(rows: Sequence[Row]) -> list[str]:
 
 
 def page(rows: Sequence[Row], where: Mapping[str, Any]) -> str:
-    """The table with what it needs to be understood."""
+    """The table of what was trained, with what it needs to be understood."""
     parts = [
         f"{sentence(where)}. PSNR in the person's box on held-out images, effect off → on, of the "
-        "final image and of Step I's colour; one seed. Milliseconds per frame for painting and "
-        "for reading from disk, off and on in turn, medians.",
-        markdown(pd.DataFrame([_cells(row) for row in rows])),
+        "final image; one seed. Milliseconds per image, off and on in turn, medians.",
+        markdown(pd.DataFrame([_cells(row) for row in rows if row.runs])),
     ]
     marks = sorted({mark for row in rows for mark in row.marks})
     return "\n\n".join([*parts, *(f"Note: {mark}." for mark in marks)])
@@ -249,10 +248,7 @@ def _cells(row: Row) -> dict[str, str]:
         "scene": row.scene,
         "auto": f"{'on' if row.auto else 'off'}{wrong}: {row.why}",
         "gain dB": _gain(row, "full"),
-        "Step I dB": _gain(row, "splat"),
-        "held out": row.split,
         "paint ms": _change(row.paint_ms),
-        "read ms": _change(row.read_ms),
         "parameters": f"{change:+,}" if row.parameters else NOTHING,
     }
 

@@ -480,7 +480,8 @@ def mix(truth: Path, prepared: Path, out: Path, rung: str) -> None:
                 alpha = cv2.imread(str(mask), 0)[..., None] / 255
                 image = np.round(image * alpha).astype(np.uint8)
             cv2.imwrite(str(target), image)
-    shutil.copy(truth / "meta.json", out / "meta.json")
+    meta = json.loads((truth / "meta.json").read_text())
+    write_json(out / "meta.json", meta | {"detected": joints})
 
 
 def train(data: Path, run: Path, overrides: list[str]) -> dict[str, float]:

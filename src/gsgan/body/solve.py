@@ -131,6 +131,7 @@ class Solver(nn.Module):
         # Landmarks that the body lacks have no weight.
         super().__init__()
         self.parents = len(body.parents)
+        self.joint_names = body.joint_names
         self.fingers = Fingers(body) if isinstance(body, Body) else None
         known = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):

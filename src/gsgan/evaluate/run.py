@@ -24,6 +24,7 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import VALIDATION, spread_items
+from gsgan.evaluate.align import PoseAlignment
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -200,6 +201,7 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
 # The splits that can be scored, and the mark of scores with drive=skeleton.
 HELD_OUT_SPLITS = ("novel_view", "novel_pose")
 BY_SKELETON = "driven by skeletons alone"
+ALIGNED = "body poses aligned on the scored images"
 
 
 @dataclass(frozen=True)
@@ -247,7 +249,7 @@ def evaluate_config(config: DictConfig) -> Results:
     others = ["data", "protocol", "out", "method"]
     if config.run is None:
         kind = "predictions"
-        others = ["data_root", "data_smpl", "drive", "other_capture"]
+        others = ["data_root", "data_smpl", "drive", "align", "other_capture"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(
@@ -269,6 +271,8 @@ def evaluate_config(config: DictConfig) -> Results:
         raise ConfigError(
             f"drive must be skeleton or null; got {config.drive!r}"
         )
+    if config.get("align") not in (None, "pose"):
+        raise ConfigError(f"align must be pose or null; got {config.align!r}")
     if not config.splits or not set(config.splits) <= set(HELD_OUT_SPLITS):
         raise ConfigError(
             f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {config.splits}"
@@ -317,6 +321,11 @@ def evaluate_folder(
     if config.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
+    align = None
+    if config.align is not None:
+        align = PoseAlignment()
+        out = out / "aligned"
+        marks = [*marks, ALIGNED]
     if len(set(config.splits)) < len(HELD_OUT_SPLITS):
         out = out / config.splits[0]
     if images_scored(out) > (options.score_images or math.inf):
@@ -338,7 +347,9 @@ def evaluate_folder(
         options,
         console,
         data,
-        predict=painter(avatar.to(device), solve=solve, colours=not other),
+        predict=painter(
+            avatar.to(device), solve=solve, colours=not other, align=align
+        ),
         method=method,
         device=device,
         marks=marks,

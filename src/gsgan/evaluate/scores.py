@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
+from gsgan.evaluate.align import PoseAlignment
 from gsgan.evaluate.grids import grid_rows
 from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.metrics.image import (
@@ -24,6 +25,7 @@ from gsgan.metrics.image import (
     psnr_inside,
     psnr_where,
     ssim,
+    ssim_map,
     ssim_uniform,
     ssim_where,
 )
@@ -101,10 +103,15 @@ def image_scores(
         "high_frequencies": high_frequencies(image, target)
     }
 
+    # SSIM's usual map serves the image and all regions.
+    similar = ssim_map(image, target)
+
     # PSNR and SSIM in the region and the variant that the protocol asks for.
     pooling = measures.psnr_pooling
-    window = ssim_uniform if measures.ssim_window == "uniform" else ssim
-    similarity = partial(window, value_range=measures.ssim_range)
+    uniform = measures.ssim_window == "uniform"
+    similarity = partial(
+        ssim_uniform if uniform else ssim, value_range=measures.ssim_range
+    )
     if measures.region == "body_box":
         assert box is not None
         background = BACKGROUNDS[measures.background]
@@ -119,7 +126,9 @@ def image_scores(
         )
     else:
         scores["psnr"] = psnr(image, target, pooling=pooling)
-        scores["ssim"] = similarity(image, target)
+        scores["ssim"] = similar.mean()
+        if uniform or measures.ssim_range != 1:
+            scores["ssim"] = similarity(image, target)
 
     # Edges in the whole image and in the person's box.
     scores["edge_f1"], scores["edge_ratio"] = edge_scores(image, target)
@@ -133,12 +142,10 @@ def image_scores(
         edges = edge_scores(image, target, person)
         scores["edge_f1_person"], scores["edge_ratio_person"] = edges
 
-    # PSNR and SSIM of all regions, from one map of SSIM.
-    if regions:
-        similar = ssim_where(image, target, *regions.values())
-        for (name, region), mean in zip(regions.items(), similar, strict=True):
-            scores[f"psnr_{name}"] = psnr_where(image, target, region)
-            scores[f"ssim_{name}"] = mean
+    # PSNR and SSIM of all regions.
+    for name, region in regions.items():
+        scores[f"psnr_{name}"] = psnr_where(image, target, region)
+        scores[f"ssim_{name}"] = ssim_where(similar, region)
 
     # LPIPS, with features of the ground truth that all variants share.
     if lpips is not None:
@@ -244,7 +251,11 @@ class SplitScores:
 
 
 def painter(
-    avatar: Avatar, *, solve: bool = False, colours: bool = True
+    avatar: Avatar,
+    *,
+    solve: bool = False,
+    colours: bool = True,
+    align: PoseAlignment | None = None,
 ) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full`` and, where a generator painted
     it, Step I's colour as ``splat``, each with its own alpha.
@@ -253,15 +264,19 @@ def painter(
         avatar: to evaluate.
         solve: solve every body pose from the skeleton, in place of the data's.
         colours: correct for the cameras' colours; False if they are not the training cameras.
+        align: the body poses on the images that are scored.
     """
 
     def predict(frame: Frame, item: Item) -> Prediction:
         # Without a body pose, the avatar solves it from the skeleton.
         if solve:
             frame = replace(frame, body=None)
-        *inputs, camera_index = frame.inputs
+        camera_index = frame.camera_index if colours else None
+        if align is not None:
+            frame = replace(frame, body=align(avatar, frame, camera_index))
+        *inputs, _ = frame.inputs
         with torch.no_grad():
-            painting = avatar(*inputs, camera_index if colours else None)
+            painting = avatar(*inputs, camera_index)
 
         # The variants of the image.
         assert painting.image is not None

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms, skin
 from gsgan.body.skinned import carry, vertex_normals
+from gsgan.body.turns import turn_scale, turned
 from gsgan.fit.frames import MaskedFrames, Silhouette, around
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.scene import BodyPose, Camera, Gaussians
@@ -196,12 +197,8 @@ class Fitter:
         nn.init.zeros_(self.moves.weight)
 
         # Translations have a smaller rate than angles: one rate for both, and a scale.
-        scale = torch.ones(self.bones + 1, 1, device=device)
-        scale[-1] = settings.transl_rate / settings.angle_rate
-        for bone, name in enumerate(body.joint_names):
-            if name.startswith(("finger", "toe")):
-                scale[bone] = 0
-        self.scale = scale
+        transl = settings.transl_rate / settings.angle_rate
+        self.scale = turn_scale(body.joint_names, transl).to(device)
 
         # weights of the landmarks, and an optimiser each for surface and poses
         self.weight = frames.visibility.clone()
@@ -223,10 +220,8 @@ class Fitter:
             rows = torch.arange(len(self.start.theta))
         rows = rows.to(self.start.theta.device)
         move = self.moves(rows).view(len(rows), -1, 3) * self.scale
-        return BodyPose(
-            theta=self.start.theta[rows] + move[:, :-1],
-            transl=self.start.transl[rows] + move[:, -1],
-        )
+        start = BodyPose(self.start.theta[rows], self.start.transl[rows])
+        return turned(start, move)
 
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""

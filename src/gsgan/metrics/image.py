@@ -101,25 +101,29 @@ def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 def outline(mask: Tensor) -> Tensor:
     """``[B, 1, H, W]`` bool: the pixels within `OUTLINE_WIDTH` of the mask's outline."""
-    # The maximum filter dilates the mask; the minimum filter erodes it.
-    person = (mask >= 0.5).to(mask)
+    # Dilated and eroded masks differ there; OpenCV's filters are separable.
     side = 2 * OUTLINE_WIDTH + 1
-    dilated = functional.max_pool2d(person, side, 1, OUTLINE_WIDTH)
-    eroded = -functional.max_pool2d(-person, side, 1, OUTLINE_WIDTH)
-    return dilated != eroded
+    kernel = np.ones((side, side), np.uint8)
+    borders = []
+    for person in (mask[:, 0] >= 0.5).cpu().numpy().astype(np.uint8):
+        gradient = cv2.morphologyEx(person, cv2.MORPH_GRADIENT, kernel)
+        borders.append(torch.from_numpy(gradient > 0))
+    return torch.stack(borders).unsqueeze(1).to(mask.device)
 
 
-def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
-    """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
-    empty region."""
-    # [B, 1, H, W]
-    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
-    means = []
-    for region in regions:
-        total = (similar * region).flatten(1).sum(dim=1)
-        count = region.flatten(1).sum(dim=1)
-        means.append(total / count)
-    return means
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """``[B, 1, H, W]`` SSIM at every pixel, mean over channels; NaN everywhere if a side is shorter
+    than `MIN_SIDE`."""
+    if min(image.shape[-2:]) < MIN_SIDE:
+        return torch.full_like(image[:, :1], torch.nan)
+    return 1 - d_ssim_map(image, target).mean(dim=1, keepdim=True)
+
+
+def ssim_where(similar: Tensor, region: Tensor) -> Tensor:
+    """The mean ``[B]`` of `ssim_map` over a region ``[B, 1, H, W]``; its windows reach beyond the
+    region, and it is NaN for an empty one."""
+    total = (similar * region).flatten(1).sum(dim=1)
+    return total / region.flatten(1).sum(dim=1)
 
 
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:

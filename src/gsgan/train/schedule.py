@@ -19,7 +19,7 @@ STRETCHED_STEPS = (
     "coarse",
 )
 # optimisers of the parts that make Step I's image
-SPLATTING = ("psi", "colour")
+SPLATTING = ("psi", "colour", "poses")
 # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 FROM_MASKS = 800
 

@@ -1,0 +1,64 @@
+"""Small turns of a body's joints and moves of its root, found through images."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.scene import BodyPose
+
+# metres of the root's move for each radian of a joint's turn
+METRES_PER_RADIAN = 0.375
+# joints that are too small in an image to be found there
+SMALL_JOINTS = ("finger", "toe")
+
+
+def turn_scale(joint_names: Sequence[str], transl: float) -> Tensor:
+    """``[bones + 1, 1]`` factors of parameters that share a learning rate: 1 for turns, 0 for
+    those of fingers and toes, and ``transl`` for the root's move, the last row."""
+    scale = torch.ones(len(joint_names) + 1, 1)
+    scale[-1] = transl
+    for bone, name in enumerate(joint_names):
+        if name.startswith(SMALL_JOINTS):
+            scale[bone] = 0
+    return scale
+
+
+def turned(pose: BodyPose, moves: Tensor) -> BodyPose:
+    """B poses changed by ``[B, bones + 1, 3]``: radians of each joint, and metres of the root."""
+    theta = pose.theta + moves[:, :-1]
+    transl = pose.transl + moves[:, -1]
+    return replace(pose, theta=theta, transl=transl, bones=None)
+
+
+class PoseCorrections(nn.Module):
+    """Turns of the joints in each training frame, which are learned with the avatar.
+
+    Their mean over the frames is zero: a turn that all frames share would move the avatar away
+    from the skeletons that drive it later.
+
+    Args:
+        frames: numbers of the training frames.
+        joint_names: of the body.
+
+    Source: ours; poses are learned with the avatar in most methods for captures without markers.
+    """
+
+    frames: Tensor
+    scale: Tensor
+
+    def __init__(
+        self, frames: Sequence[int], joint_names: Sequence[str]
+    ) -> None:
+        super().__init__()
+        self.register_buffer("frames", torch.tensor(sorted(frames)))
+        scale = turn_scale(joint_names, METRES_PER_RADIAN)
+        self.register_buffer("scale", scale, persistent=False)
+        self.moves = nn.Parameter(torch.zeros(len(frames), len(scale), 3))
+
+    def forward(self, pose: BodyPose, frame_id: Tensor) -> BodyPose:
+        """The poses of the training frames ``[B]``, corrected."""
+        moves = (self.moves - self.moves.mean(0)) * self.scale
+        rows = torch.searchsorted(self.frames, frame_id)
+        return turned(pose, moves[rows])
