@@ -322,3 +322,8 @@ def test_every_file_that_cannot_be_read_is_named_at_once(copy, check):
     assert report.errors == len(messages) == 3
     for name in ("meta.json", "cameras.json", "landmarks3d.npz"):
         assert any(name in message for message in messages), messages
+
+
+def test_a_folder_that_does_not_exist_is_one_error(tmp_path, check):
+    report = check(tmp_path / "gone")
+    assert "gone does not exist" in only(report, "error")

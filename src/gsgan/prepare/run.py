@@ -62,6 +62,7 @@ from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
+TURNED = 1e-4  # degrees: less is rounding of cameras that were kept
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
 CORRECTED = 1.0  # frames: whole offsets leave up to half a frame
@@ -136,7 +137,7 @@ def _camera_notes(solution: Solution, turned: Float) -> list[str]:
     given, refined = solution.frontier
     if not np.isfinite(given):
         return []
-    if turned.any():
+    if turned.max() > TURNED:
         return [
             f"the cameras were refined: silhouettes of two cameras now agree within {refined:.2f} "
             f"pixels (median), with the given calibration {given:.2f}"
