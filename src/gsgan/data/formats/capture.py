@@ -208,8 +208,6 @@ def capture_problems(
         already: reasons that are known; the files that they name are not named again.
     """
     problems: list[str] = []
-    if not root.is_dir():
-        return problems
 
     # Each message once: several steps may read the same file.
     def attempt(read: Callable[[], Content]) -> Content | None:
