@@ -146,7 +146,7 @@ def test_segmentation_of_a_model_file(build, tiny, tmp_path):
     avatar = build_avatar(tiny(), scene)
     assert avatar.segmentation_why == "parts by the body's joints"
     # this data has no labels to learn from
-    assert avatar.segmentation.common is not None
+    assert not avatar.segmentation.labelled
     pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
     painting = avatar(*dataclasses.replace(frame, body=pose).inputs)
     assert painting.segmentation.shape[1] == 12  # no joint has hair

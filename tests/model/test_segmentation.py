@@ -2,19 +2,21 @@
 
 import math
 import shutil
-from functools import cache
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-from gsgan.body import free_body
+from gsgan.body import blend_transforms, free_body, skin
 from gsgan.body.smpl_names import CIHP, CLOTHES
 from gsgan.model.segmentation import (
     IGNORE,
     Segmentation,
     class_map,
     segmentation_loss,
-    silhouette_loss,
+    turn_to,
 )
 from gsgan.run.assemble import build_data
 from gsgan.run.runs import load_avatar
@@ -62,109 +64,77 @@ def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
     assert (S.grad[..., 1] == 0).all()
 
 
-# --- masks in the place of labels -----------------------------------------------------------------
+# --- data without labels --------------------------------------------------------------------------
 
 
-def without_labels(**options) -> Segmentation:
-    return Segmentation(free_body(), points=400, labelled=False, **options)
+def bent_pose(seed: int) -> BodyPose:
+    body = free_body()
+    theta = torch.zeros(1, len(body.parents), 3)
+    generator = torch.Generator().manual_seed(seed)
+    for bone, name in enumerate(body.joint_names):
+        if name.startswith(
+            ("upperarm01", "lowerarm01", "upperleg01", "lowerleg01")
+        ):
+            theta[0, bone] = 0.35 * torch.randn(3, generator=generator)
+    return BodyPose(theta, torch.zeros(1, 3))
 
 
-@cache
-def body_mask() -> torch.Tensor:
-    with torch.no_grad():
-        raster = Segmentation(free_body(), points=2000).raster(
-            rest_pose(), facing_camera()
+def painted_mask(pose: BodyPose, camera: Camera) -> np.ndarray:
+    """``[H, W]`` the pixels that the body's triangles cover."""
+    body = free_body()
+    A, t = blend_transforms(
+        body.transforms(pose), body.bone_index, body.bone_weight
+    )
+    px, _ = camera.project(skin(body.vertices.float(), A, t))
+    mask = np.zeros(camera.size, np.uint8)
+    corners = np.round(px[0].numpy() - 0.5).astype(np.int32)
+    for triangle in body.faces.numpy():
+        cv2.fillConvexPoly(mask, corners[triangle], 1)
+    return mask > 0
+
+
+@pytest.mark.parametrize("size", [(512, 512), (1150, 1330)])
+def test_without_labels_a_solid_person_has_no_holes(size):
+    segmentation = Segmentation(free_body(), points=6000, labelled=False)
+    height, width = size
+    focal = 1.4 * height
+    overlaps = []
+    for turn in range(8):
+        pose = bent_pose(turn)
+        sine, cosine = (
+            math.sin(turn * math.pi / 4),
+            math.cos(turn * math.pi / 4),
         )
-    return (raster.alpha > 0.5).float()
+        R = torch.tensor(
+            [[[cosine, sine, 0], [0, 0, -1.0], [-sine, cosine, 0]]]
+        )
+        t = torch.tensor([[0.0, 0, 3]]) - R[:, :, 2] * 0.85
+        K = torch.tensor(
+            [[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]]
+        )
+        camera = Camera(K, R, t, size)
+        with torch.no_grad():
+            person = segmentation(pose, camera).argmax(1)[0].numpy() > 0
+        mask = painted_mask(pose, camera)
+        inside = cv2.erode(mask.astype(np.uint8), np.ones((9, 9))) > 0
+        assert inside.sum() > 0.04 * mask.size
+        assert (~person[inside]).mean() < 3e-4
+        overlaps.append((person & mask).sum() / (person | mask).sum())
+    assert np.mean(overlaps) > 0.92
 
 
-def fit_to(
-    segmentation: Segmentation, mask: torch.Tensor, steps: int = 15
-) -> list[float]:
-    """The loss of each step of its own optimiser groups."""
-    groups = [
-        {"params": parameters, "lr": 1e-2 * factor}
-        for parameters, factor in segmentation.parameter_groups()
-    ]
-    optimiser, losses = torch.optim.Adam(groups), []
-    for _ in range(steps):
-        alpha = segmentation.raster(rest_pose(), facing_camera()).alpha
-        loss = silhouette_loss(alpha, mask)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    return losses
+def test_without_labels_nothing_of_S_learns():
+    segmentation = Segmentation(free_body(), points=400, labelled=False)
+    assert not any(p.requires_grad for p in segmentation.parameters())
 
 
-def test_without_labels_two_numbers_learn_from_masks_and_nothing_else_moves():
-    segmentation = without_labels(scale=0.3)
-    assert [p.shape for p in segmentation.parameters() if p.requires_grad] == [
-        (2,)
-    ]
-    before = {
-        name: value.clone() for name, value in segmentation.state_dict().items()
-    }
-    losses = fit_to(segmentation, body_mask())
-    assert losses[-1] < 0.8 * losses[0]
-    moved = {
-        k
-        for k, v in segmentation.state_dict().items()
-        if not torch.equal(v, before[k])
-    }
-    assert moved == {"common"}
-    assert bool((segmentation.common != 0).all())
-    assert segmentation.common[0] > 0  # too small shapes grew
-
-
-def test_common_is_added_to_all_log_scales_and_all_logits():
-    one, other = without_labels(), without_labels()
-    with torch.no_grad():
-        one.common.copy_(torch.tensor([0.4, -1.5]))
-        other.log_scales += 0.4
-        other.logit_opacities -= 1.5
-        a, b = one.gaussians(rest_pose()), other.gaussians(rest_pose())
-    torch.testing.assert_close(a.covariances, b.covariances)
-    torch.testing.assert_close(a.opacities, b.opacities)
-    assert not torch.allclose(
-        a.opacities, without_labels().gaussians(rest_pose()).opacities
-    )
-
-
-def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
+def test_quats_turn_the_third_axis_to_the_normals():
     generator = torch.Generator().manual_seed(0)
-    alpha, mask = (
-        torch.rand(2, 1, 5, 7, generator=generator) for _ in range(2)
-    )
-    alpha.requires_grad_()
-    unsure = torch.zeros(2, 1, 5, 7)
-    unsure[..., 2] = 0.3
-    loss = silhouette_loss(alpha, mask, unsure)
-    sure = unsure == 0
-    expected = torch.nn.functional.binary_cross_entropy(alpha[sure], mask[sure])
-    torch.testing.assert_close(loss, expected, atol=1e-4, rtol=0)
-    loss.backward()
-    assert bool((alpha.grad[~sure] == 0).all())
-    assert bool((alpha.grad[sure] != 0).all())
-    # none is sure
-    assert (
-        float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0
-    )
-
-
-@pytest.mark.parametrize("truth", [0.0, 1.0])
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
-    alpha = torch.full((1, 1, 2, 2), value, requires_grad=True)
-    loss = silhouette_loss(alpha, torch.full_like(alpha, truth).detach())
-    loss.backward()
-    expected = 0 if value == truth else -math.log(1e-6)
-    assert math.isclose(
-        float(loss.detach()), expected, rel_tol=1e-5, abs_tol=1e-5
-    )
-    assert torch.isfinite(alpha.grad).all()
-    if value != truth:  # there is a way back
-        assert bool((alpha.grad.sign() == (1 if value > truth else -1)).all())
+    normals = torch.randn(50, 3, generator=generator)
+    poles = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
+    normals = torch.cat([torch.nn.functional.normalize(normals, dim=1), poles])
+    turned = quaternion_to_rotation_matrix(turn_to(normals))[:, :, 2]
+    torch.testing.assert_close(turned, normals, atol=1e-5, rtol=0)
 
 
 # --- classes -------------------------------------------------------------------------------------
@@ -264,7 +234,7 @@ def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(
     data = build_data(config)
     assert not data.info.has_labels
     avatar, _ = load_avatar(run, config, data)
-    assert avatar.segmentation.common is None
+    assert avatar.segmentation.labelled
 
 
 def test_labels_of_held_out_images_alone_teach_nothing(
@@ -277,4 +247,4 @@ def test_labels_of_held_out_images_alone_teach_nothing(
     data, avatar, _ = build(f"data.root={some}")
     assert data.layout.labels
     assert not data.info.has_labels
-    assert avatar.segmentation.common is not None
+    assert not avatar.segmentation.labelled

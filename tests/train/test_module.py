@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from lightning import Trainer
-from torch.utils.data import DataLoader
 
 from gsgan.losses.adversarial import (
     FORMS,
@@ -116,32 +115,6 @@ def test_randomness_follows_from_seed_and_step(make):
 
 
 # --- S without labels
-
-
-@pytest.fixture
-def unlabelled(tmp_path):
-    """A small capture with body poses and no labels."""
-    from make import write_tiny_capture
-
-    return write_tiny_capture(
-        tmp_path / "unlabelled",
-        frames=3,
-        size=(48, 48),
-        body_pose=True,
-        meta={"body": "free"},
-    )
-
-
-def test_unsure_pixels_teach_s_nothing(make, unlabelled):
-    module, trainer, data = make(
-        f"data.root={unlabelled}", "training.schedule.segmentation=2",
-        "training.schedule.step_one=0", "training.schedule.step_two=0",
-    )  # fmt: skip
-    frame = data.dataset("train")[0]
-    doubtful = replace(frame, unsure=torch.ones_like(frame.mask))
-    trainer.fit(module, DataLoader([doubtful] * 2, batch_size=None))
-    assert module.step == 2
-    assert not module.avatar.segmentation.common.any()
 
 
 def test_feature_head_commutes_with_blending(make):

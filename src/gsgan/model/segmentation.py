@@ -1,5 +1,6 @@
 """The novel-view segmentation module: a skinned body splatted into part probabilities S."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,8 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.body import SkinnedBody, skin
+from gsgan.body.skinned import vertex_normals
 from gsgan.body.smpl_names import group_of_part
-from gsgan.model.body_points import SkinnedGaussians
+from gsgan.model.body_points import SkinnedGaussians, neighbour_distance
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import ACCURACY, Accuracy, rasterise
 from gsgan.utils.checks import one_of
@@ -20,6 +22,8 @@ from gsgan.utils.tensors import full_precision
 IGNORE = 255
 # inside logarithms, so that a class without splats has a gradient
 PROBABILITY_FLOOR = 1e-6
+# a point's neighbour up to which its Gaussian reaches
+GAP_NEIGHBOUR = 4
 HANDS = ("left_hand", "right_hand")
 FACE_CLASS = "face_neck"
 
@@ -34,14 +38,16 @@ class Segmentation(SkinnedGaussians):
     Args:
         body: vertices, weights, joints and part labels.
         mode, hands_face: the classes, see `class_map`.
-        points, opacity, scale: see `SkinnedGaussians`.
+        points, opacity: see `SkinnedGaussians`.
+        scale: initial standard deviation along the surface, as a share of the distance to the
+            fourth nearest point, so that no gap is left between them.
+        thickness: initial standard deviation across the surface, as a share of that along it. Flat
+            Gaussians end at the silhouette, where round ones reach beyond it.
         accuracy: the rasteriser's settings.
         labelled: whether the data has part labels, from which every shape and opacity learns.
-            Without them only a factor on all scales and one on all opacities learn, from the
-            masks: free shapes would grow over each other's parts to fit the silhouette (mIoU on
-            held-out poses 0.54, with two factors 0.75, from labels 0.90).
+            Without them the Gaussians stay as they are.
 
-    Source: paper Sec. 3.4, which learns from labels only.
+    Source: paper Sec. 3.4, which learns from labels; flat Gaussians are ours.
     """
 
     one_hot: Tensor
@@ -57,11 +63,15 @@ class Segmentation(SkinnedGaussians):
         hands_face: bool = False,
         points: int | None = None,
         opacity: float = 0.9,
-        scale: float = 0.7,
+        scale: float = 0.45,
+        thickness: float = 0.1,
         accuracy: Accuracy = ACCURACY["standard"],
         labelled: bool = True,
     ) -> None:
         super().__init__(body, points, opacity, scale)
+        self._flatten(body, scale, thickness)
+        self.labelled = labelled
+        self.requires_grad_(labelled)
 
         # The classes of S, and how the data's labels map to them.
         self.accuracy = accuracy
@@ -84,17 +94,23 @@ class Segmentation(SkinnedGaussians):
         self.register_load_state_dict_post_hook(_classes_as_loaded)
         self.all_classed = bool((self.one_hot.sum(dim=1) > 0).all())
 
-        # Without part labels two numbers learn in place of all shapes.
-        self.common: nn.Parameter | None = None
-        if not labelled:
-            self.requires_grad_(False)
-            # added to all log scales, and all logits
-            self.common = nn.Parameter(torch.zeros(2))
+    @torch.no_grad()
+    def _flatten(
+        self, body: SkinnedBody, scale: float, thickness: float
+    ) -> None:
+        """Makes the Gaussians discs on the body's surface, see the class."""
+        # The third axis of each Gaussian becomes the normal.
+        normals = vertex_normals(body.vertices.float(), body.faces)
+        self.quats.copy_(turn_to(normals[self.points.chosen]))
+
+        # Scales that leave no gap between the points, and little across the surface.
+        gap = neighbour_distance(self.points.means, GAP_NEIGHBOUR)
+        along = (scale * gap.clamp_min(1e-4)).log()
+        across = along + math.log(thickness)
+        self.log_scales.copy_(torch.stack([along, along, across], dim=1))
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
         """(parameters, multiplier of the learning rate); the multipliers are ours."""
-        if self.common is not None:
-            return [([self.common], 10.0)]
         return [
             ([self.quats], 1.0),
             ([self.log_scales], 5.0),
@@ -132,18 +148,11 @@ class Segmentation(SkinnedGaussians):
     def gaussians(self, pose: BodyPose) -> Gaussians:
         """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
         A, t = self.points.blend(pose)
-
-        # Shapes and opacities, with the two common factors where S learns from masks.
-        log_scales: Tensor = self.log_scales
-        logits: Tensor = self.logit_opacities
-        if self.common is not None:
-            log_scales = log_scales + self.common[0]
-            logits = logits + self.common[1]
-
-        # The means move by LBS.
         means = skin(self.points.means, A, t)
         features = self.one_hot.expand(len(A), -1, -1)
-        return self.deformed(A, means, log_scales, logits, features)
+        return self.deformed(
+            A, means, self.log_scales, self.logit_opacities, features
+        )
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
         """The splatted body: features are its classes, alpha its silhouette."""
@@ -172,13 +181,8 @@ class Segmentation(SkinnedGaussians):
         return torch.cat(rows, dim=-1).movedim(-1, 1)
 
     def loss(self, frame: Frame) -> Tensor:
-        """The loss of a frame: on its labels, or on its mask where the data has no labels."""
+        """The loss of a frame on its labels."""
         assert frame.body is not None
-
-        # Without part labels the silhouette is compared with the mask.
-        if self.common is not None:
-            alpha = self.raster(frame.body, frame.camera).alpha
-            return silhouette_loss(alpha, frame.mask, frame.unsure)
         labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
 
         # Nothing is learned from an image without labels.
@@ -191,6 +195,16 @@ def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
     """Applies a checkpoint's voted labels."""
     assert isinstance(segmentation, Segmentation)
     segmentation.one_hot.copy_(segmentation._classes_of_points())
+
+
+def turn_to(normals: Tensor) -> Tensor:
+    """``[N, 4]`` quats that turn the third axis to unit normals ``[N, 3]``."""
+    # The half-way rotation between z and n is (1 + n_z, z × n); n = -z is a turn about x.
+    nx, ny, nz = normals.unbind(1)
+    quats = torch.stack([1 + nz, -ny, nx, torch.zeros_like(nz)], dim=1)
+    opposite = quats.new_tensor([0.0, 1.0, 0.0, 0.0])
+    quats = torch.where(nz[:, None] < -0.999, opposite, quats)
+    return functional.normalize(quats, dim=1)
 
 
 def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
@@ -213,29 +227,6 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor) -> Tensor:
         log, labels, ignore_index=IGNORE, reduction="sum"
     )
     return total / (labels != IGNORE).sum().clamp_min(1)
-
-
-def silhouette_loss(
-    alpha: Tensor, mask: Tensor, unsure: Tensor | None = None
-) -> Tensor:
-    """Binary cross-entropy of the splatted body's silhouette, for data without part labels.
-
-    Args:
-        alpha: ``[B, 1, H, W]`` of `Segmentation.raster`.
-        mask: ``[B, 1, H, W]`` in [0, 1].
-        unsure: ``[B, 1, H, W]`` above 0 at pixels to leave out, or None.
-
-    Returns:
-        The mean over the other pixels; 0 where there are none.
-    """
-    # Probabilities of the person and of the rest, kept away from a logarithm of zero.
-    log_person = (alpha + PROBABILITY_FLOOR).log()
-    log_rest = (1 - alpha + PROBABILITY_FLOOR).log()
-    loss = -(mask * log_person + (1 - mask) * log_rest)
-
-    # Unsure pixels are left out of the mean.
-    sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
-    return (loss * sure).sum() / sure.sum().clamp_min(1)
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,7 @@ def fitted_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     """The schedule with the phases that an avatar has, see `Schedule.fitted`."""
     S = avatar.segmentation
     return schedule.fitted(
-        segmentation=S is not None,
-        from_masks=S is not None and S.common is not None,
+        segmentation=S is not None and S.labelled,
         splats=avatar.splats is not None,
         generator=avatar.generator is not None,
     )

@@ -61,7 +61,7 @@ def parameter_groups(
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
     # S learns alone, in the first phase.
     groups = {}
-    if avatar.segmentation is not None:
+    if avatar.segmentation is not None and avatar.segmentation.labelled:
         groups["segmentation"] = avatar.segmentation.parameter_groups()
 
     # Ψ, the readout of F and the learnt skinning weights share an optimiser.

@@ -20,8 +20,6 @@ STRETCHED_STEPS = (
 )
 # optimisers of the parts that make Step I's image
 SPLATTING = ("psi", "colour", "poses")
-# iterations of S, at most, where two numbers learn from masks (docs/effects.md)
-FROM_MASKS = 800
 
 
 @dataclass(frozen=True)
@@ -58,15 +56,14 @@ class Schedule:
         self,
         *,
         segmentation: bool,
-        from_masks: bool,
         splats: bool,
         generator: bool,
     ) -> Schedule:
         """The schedule of a model with these parts, stretched.
 
-        Without S its phase is left out. Without a generator Step I gets Step II's iterations, and
-        without splats the other way round, so that every variant trains equally long. S learns only
-        two numbers from masks, which needs fewer iterations.
+        Without S, or labels that it learns from, its phase is left out. Without a generator Step I
+        gets Step II's iterations, and without splats the other way round, so that every variant
+        trains equally long.
         """
         # All lengths but those of S and the epoch are stretched.
         numbers = {
@@ -82,12 +79,9 @@ class Schedule:
             two = 0
         if not splats:
             one, two = 0, one + two
-
-        # S has fewer iterations where it learns from masks.
-        maximum = FROM_MASKS if from_masks else self.segmentation
         return replace(
             self,
-            segmentation=min(self.segmentation, maximum) if segmentation else 0,
+            segmentation=self.segmentation if segmentation else 0,
             **numbers | {"step_one": one, "step_two": two},
         )
 
