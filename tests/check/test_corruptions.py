@@ -138,6 +138,32 @@ def test_images_from_1_and_masks_from_0_are_a_warning(copy, check):
     assert "images are numbered from 1, landmarks from 0" in text
 
 
+def renumber_masks(copy: Path) -> None:
+    for path in sorted((copy / "masks").glob("*/*"), reverse=True):
+        path.rename(path.with_name(f"{int(path.stem) + 1:06d}.png"))
+
+
+def renumber_landmarks(copy: Path) -> None:
+    path = copy / "landmarks3d.npz"
+    arrays = dict(np.load(path))
+    np.savez(path, **arrays | {"frame_id": arrays["frame_id"] + 100})
+
+
+@pytest.mark.parametrize(
+    ("renumber", "others"),
+    [
+        (renumber_masks, "masks from 1"),
+        (renumber_landmarks, "landmarks from 100"),
+    ],
+)
+def test_images_from_0_and_others_from_elsewhere_are_named(
+    copy, check, renumber, others
+):
+    renumber(copy)
+    text = " ".join(f.sentence for f in check(copy).findings)
+    assert f"images are numbered from 0, {others}" in text
+
+
 @pytest.mark.parametrize("name", ["{}_0.png", "frame{}_cam1.png"])
 def test_the_number_that_differs_counts_frames(copy, check, name):
     for folder in ("images", "masks"):
@@ -296,3 +322,8 @@ def test_every_file_that_cannot_be_read_is_named_at_once(copy, check):
     assert report.errors == len(messages) == 3
     for name in ("meta.json", "cameras.json", "landmarks3d.npz"):
         assert any(name in message for message in messages), messages
+
+
+def test_a_folder_that_does_not_exist_is_one_error(tmp_path, check):
+    report = check(tmp_path / "gone")
+    assert "gone does not exist" in only(report, "error")

@@ -272,6 +272,7 @@ ZJU: list[Case] = [
         ],
     ),
     (r"2\.npy.*'poses'.* 72 .*69", params(poses=np.zeros((1, 66)))),
+    (r"poses.*found 87 \(SMPL-X with 6", params(poses=np.zeros((1, 87)))),
     (r"2\.npy.*'poses'.* 0", params(poses=np.full((1, 72), 0.1))),
     ("'Rh'", params(Rh=np.full((1, 3), np.nan))),
     (r"2\.npy.*'Rh'", objects("new_params/2.npy", lambda c: c.pop("Rh"))),

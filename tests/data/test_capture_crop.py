@@ -10,6 +10,7 @@ import torch
 from capture_frames import every_frame, items
 from make import edit_json, write_tiny_capture
 
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.capture import read_capture
@@ -91,7 +92,8 @@ def test_lens_folding_back_shows_nothing(tmp_path):
         np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]),
         np.array([-0.3, *[0.0] * 7]),
     )
-    mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
+    camera = CameraEntry("a", K, np.eye(3), np.zeros(3), dist, size=(100, 100))
+    mapping = undistort_map(camera, Crop(0, -150, (100, 400)))
     # r (1 - 0.3 r²) rises up to r = 1.054: column 250 is at r = 2
     assert (mapping[50, -1] < -1000).all()
     assert np.allclose(mapping[50, 200], 49.5 + np.array([0.5, 0.5]), atol=0.01)

@@ -735,6 +735,60 @@ def test_published_keys_of_the_smpl_family(tmp_path, shared, proportions, name):
     )
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".pth"])
+def test_tracks_of_tram_are_read_in_the_world_of_its_camera(
+    tmp_path, shared, proportions, suffix
+):
+    """A pickle of tensors; of frame 2 there is nothing, and camera.npy has the camera's way."""
+    from writers.smpl import write_smpl
+
+    model = shared("smplx.npz", lambda path: write_smpl(path, kind="smplx"))
+    skinned = read_smpl(model)
+    rng = np.random.default_rng(3)
+    vectors = 0.3 * rng.standard_normal((4, 22, 3))
+    moves = rng.standard_normal((4, 3))
+    theta = torch.zeros(4, len(skinned.parents), 3, dtype=torch.float64)
+    theta[:, :22] = torch.from_numpy(vectors)
+    still = theta.new_zeros(1, 1)
+    joints = skinned.pose(theta, still, torch.from_numpy(moves))[1].numpy()
+
+    # The same person in the axes of a camera that moves.
+    frames = np.array([0, 1, 3, 4])
+    way = Rotation.random(5, random_state=0)
+    places = rng.standard_normal((5, 3))
+    root = skinned.rest_joints(torch.zeros(1, 10, dtype=torch.float64))
+    root = root[0, 0].numpy()
+    inverse = way[frames].inv()
+    rotations = np.tile(np.eye(3), (4, 24, 1, 1))
+    flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    rotations[:, :22] = flat.reshape(4, 22, 3, 3)
+    rotations[:, 0] = inverse.as_matrix() @ rotations[:, 0]
+    seen = inverse.apply(moves + root - places[frames]) - root
+    track = {
+        "pred_cam": torch.zeros(4, 3),
+        "pred_rotmat": torch.from_numpy(rotations).float(),
+        "pred_shape": torch.zeros(4, 10),
+        "pred_trans": torch.from_numpy(seen).float()[:, None],
+        "frame": torch.from_numpy(frames),
+    }
+    path = tmp_path / "hps" / f"hps_track_0{suffix}"
+    path.parent.mkdir()
+    if suffix == ".npy":
+        np.save(path, track)
+    else:
+        torch.save(track, path)
+    camera = {"world_cam_R": way.as_matrix(), "world_cam_T": places}
+    np.save(tmp_path / "camera.npy", camera)
+    motion = read_motion(path, Source(proportions, model))
+    assert len(motion.p) == 5
+    assert np.isnan(motion.p[2]).all()
+    np.testing.assert_allclose(
+        motion.p[frames][:, list(SMPL_AT)],
+        joints[:, list(SMPL_AT.values())],
+        atol=1e-5,
+    )
+
+
 def test_files_of_joblib_are_refused_with_a_way_to_convert_them(
     tmp_path, proportions
 ):
@@ -908,6 +962,9 @@ def test_relatives_of_smpl_are_the_same_motion(tmp_path, shared, proportions):
         np.testing.assert_allclose(
             directions(found), directions(truth), atol=1e-6, err_msg=name
         )
+
+    with pytest.raises(DataError, match=r"one frame .* motion=.*fits$"):
+        standard(fits / "000000.json", proportions, smpl=model)
 
     # AMASS' 52 joints with SMPL-H's model.
     smpl_h(tmp_path / "SMPLH.npz", smpl_arrays("smpl"))

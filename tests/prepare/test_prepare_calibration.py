@@ -1,12 +1,17 @@
 """Calibration files of other tools are read as the cameras that they describe."""
 
 import json
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from capture_scenes import LENS, ring, write_own, write_qualisys, write_toml
 
 from gsgan.data.calibration import find_calibration, read_calibration
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import Crop, take, undistort_map
+from gsgan.prepare.camera_array import undistort_points
 from gsgan.prepare.sources import pair_cameras
 from gsgan.utils.errors import DataError
 
@@ -16,6 +21,7 @@ def equal(found, expected, lens: int = 5) -> None:
     for camera in expected:
         read = found[camera.name]
         assert read.size == camera.size
+        assert read.fisheye == camera.fisheye
         np.testing.assert_allclose(read.K, camera.K, atol=1e-9)
         np.testing.assert_allclose(read.R, camera.R, atol=1e-9)
         np.testing.assert_allclose(read.t, camera.t, atol=1e-9)
@@ -151,13 +157,62 @@ def test_caliscope(tmp_path):
         read_calibration(path)
 
 
-def test_fisheye_is_refused(tmp_path):
-    path = write_toml(tmp_path / "Calib.toml", ring())
+FISHEYE = (-0.03, 0.01, -0.004, 0.001)
+
+
+def fisheye_ring() -> list[CameraEntry]:
+    return [replace(c, fisheye=True) for c in ring(dist=FISHEYE)]
+
+
+def test_fisheye_lenses_are_read_in_toml_and_json(tmp_path):
+    path = write_toml(tmp_path / "Calib.toml", fisheye_ring())
     path.write_text(
-        path.read_text().replace("fisheye = false", "fisheye = true", 1)
+        path.read_text().replace("fisheye = false", "fisheye = true")
     )
-    with pytest.raises(DataError, match=r"cam_00.*fisheye"):
+    equal(read_calibration(path).cameras, fisheye_ring())
+    path.write_text(path.read_text().replace("0.001]", "0.001, 0.1]"))
+    with pytest.raises(DataError, match=r"cam_00.*4 finite.*k1 k2 k3 k4"):
         read_calibration(path)
+    own = write_own(tmp_path / "cameras.json", fisheye_ring())
+    content = json.loads(own.read_text())
+    for camera in content.values():
+        camera |= {"fisheye": True, "dist": camera["dist"][:4]}
+    own.write_text(json.dumps(content))
+    equal(read_calibration(own).cameras, fisheye_ring())
+
+
+def test_what_a_fisheye_lens_shows_becomes_straight():
+    """Points by `cv2.fisheye.projectPoints` come back as pixels, and in a straightened image, where
+    a pinhole shows them; what is behind the camera is unknown."""
+    K = np.array([[60.0, 0, 64], [0, 62, 50], [0, 0, 1]])
+    camera = CameraEntry(
+        "a", K, np.eye(3), np.zeros(3), np.array([*FISHEYE, 0, 0, 0, 0]),
+        size=(100, 128), fisheye=True,
+    )  # fmt: skip
+    x = np.array([[0.5, 0.1, 1], [-0.6, 0.4, 1], [0.0, 0.0, 1], [0.9, -0.5, 1]])
+    stored = K.copy()
+    stored[:2, 2] -= 0.5
+    nothing = np.zeros(3)
+    shown, _ = cv2.fisheye.projectPoints(
+        x[:, None], nothing, nothing, stored, camera.dist[:4]
+    )
+    px = shown[:, 0] + 0.5
+    pinhole = (x @ K.T)[:, :2]
+    assert np.abs(px - pinhole).max() > 3
+    np.testing.assert_allclose(undistort_points(camera, px), pinhole, atol=1e-5)
+    assert np.isnan(undistort_points(camera, px + 1000)).all()
+
+    # A spot in the image of the lens.
+    window = Crop(0, 0, camera.size)
+    mapping = undistort_map(camera, window)
+    for at, expected in zip(px, pinhole, strict=True):
+        image = np.zeros((*camera.size, 3), np.uint8)
+        v, u = np.mgrid[: camera.size[0], : camera.size[1]] + 0.5
+        spot = 255 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 3)
+        image[:] = spot[..., None]
+        straight = take(image, window, mapping, exact=False)[..., 0]
+        mean = [(straight * axis).sum() / straight.sum() for axis in (u, v)]
+        np.testing.assert_allclose(mean, expected, atol=0.3)
 
 
 def test_rotation_vectors_in_degrees_are_refused(tmp_path):

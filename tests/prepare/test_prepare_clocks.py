@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -20,7 +21,7 @@ from gsgan.prepare.clocks import (
     unsteady_clocks,
 )
 from gsgan.prepare.frames import sample
-from gsgan.prepare.run import prepare
+from gsgan.prepare.run import late_clocks, prepare
 from gsgan.prepare.sources import recording_notes, video_recording
 from gsgan.prepare.stages import StageFolder
 from gsgan.utils.errors import DataError
@@ -215,6 +216,32 @@ def test_late_clocks_are_measured_to_a_tenth_of_a_frame(late):
     shown = [t + d - e for t, d, e in zip(followed, late, delay, strict=True)]
     rest, _ = clock_errors(*filmed(shown))
     assert np.abs(rest).max() <= 0.6
+
+
+@pytest.mark.parametrize(
+    ("delay", "offsets", "wrong"),
+    [
+        (2.4, None, True),
+        (-0.6, None, True),
+        (0.4, None, False),
+        (0.6, {"b": 2}, False),  # what whole offsets may leave
+        (1.6, {"b": 2}, True),
+    ],
+)
+def test_a_late_clock_is_an_error_until_it_is_corrected(delay, offsets, wrong):
+    outcome = SimpleNamespace(
+        frames=np.arange(10),
+        inputs=SimpleNamespace(sources=("a", "b")),
+        options=SimpleNamespace(offsets=offsets),
+        solution=SimpleNamespace(
+            delay=np.array([0.0, delay]), gain=np.array([0.0, 0.5])
+        ),
+    )
+    clocks = late_clocks(outcome)
+    assert clocks.wrong == wrong
+    corrected = (offsets or {}).get("b", 0) + round(delay)
+    if abs(delay) > 0.5:
+        assert f"offsets={{b: {corrected}}}" in clocks.notes[0]
 
 
 def test_a_camera_that_loses_frames_without_a_gap_is_named():

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from make import skeletons
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.options import Inputs
 from gsgan.prepare.people import one_person
-from gsgan.prepare.run import with_detections
+from gsgan.prepare.run import with_detections, with_one_person
 from gsgan.prepare.sources import Recording
 from gsgan.skeleton.joints import ALL, BODY
 from gsgan.utils.errors import DataError
@@ -84,6 +85,30 @@ def test_people_that_cannot_be_joined_are_named_and_not_the_calibration():
         wrong.append(replace(camera, t=camera.t + np.array([0, metres, 0])))
     with pytest.raises(DataError, match="several people were detected in 12"):
         one_person(given, wrong, {})
+
+
+def test_several_people_are_named_before_cameras_are_found():
+    cameras = ring()[:3]
+    given = detected(cameras, two_people(), np.zeros((3, FRAMES), int))
+    options = SimpleNamespace(calibration="person", offsets=None)
+    inputs = Inputs({}, None, cameras, (), 30.0)
+    inputs, chosen = with_one_person(options, inputs, given)
+    assert "several people were detected in 12 frames" in inputs.notes[-1]
+    assert chosen is given
+
+
+def test_landmarks_numbered_from_another_start_are_noted(tmp_path):
+    path = tmp_path / "a.npz"
+    points = {"px": np.full((4, 33, 2), 20.0), "conf": np.ones((4, 33))}
+    np.savez(path, frame_id=np.arange(1, 5), **points)
+    for files in ({}, dict.fromkeys(range(4), path)):
+        video = Recording("a", Path("a.mp4"), (8, 8), 30.0, files, 4)
+        inputs = Inputs({"a": video}, None, (), (), 30.0)
+        inputs, _ = with_detections(inputs, {"a": path})
+        assert (
+            "a: images are numbered from 0, its landmarks from 1"
+            in (inputs.notes[0])
+        )
 
 
 def test_several_faces_that_mediapipe_counts_are_noted(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -29,7 +30,16 @@ PARAMETERS = {
     "OPENCV": lambda K, d: [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d[:4]],
     "FULL_OPENCV": lambda K, d: [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d[:8]],
 }
-LENSES = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8}
+for _fisheye, _same in (
+    ("OPENCV_FISHEYE", "OPENCV"),
+    ("SIMPLE_RADIAL_FISHEYE", "SIMPLE_RADIAL"),
+    ("RADIAL_FISHEYE", "RADIAL"),
+):
+    PARAMETERS[_fisheye] = PARAMETERS[_same]
+LENSES = {
+    "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8,
+    "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4,
+}  # fmt: skip
 
 
 def rig_of(model: str) -> list[CameraEntry]:
@@ -37,7 +47,8 @@ def rig_of(model: str) -> list[CameraEntry]:
     terms = LENSES.get(model, 0)
     dist = [*LENS, 0.02, 0.01, -0.01][:terms]
     dist = [*dist, *[0.0] * (4 - len(dist))] if terms < 5 else dist
-    return ring(dist=dist)
+    fisheye = "FISHEYE" in model
+    return [replace(camera, fisheye=fisheye) for camera in ring(dist=dist)]
 
 
 def write_colmap(
@@ -81,6 +92,7 @@ def equal(
     for camera in expected:
         read = found[camera.name]
         assert read.size == camera.size
+        assert read.fisheye == camera.fisheye
         for name in ("K", "R", "t", "dist"):
             np.testing.assert_allclose(
                 getattr(read, name), getattr(camera, name), atol=1e-9
@@ -222,6 +234,19 @@ def test_nerfstudio(tmp_path, own):
     assert (calibration.format, calibration.metric) == ("nerfstudio", False)
 
 
+@pytest.mark.parametrize(
+    "says", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}]
+)
+def test_fisheye_lenses_of_nerfstudio(tmp_path, says):
+    path = write_nerfstudio(tmp_path / "transforms.json", ring(), own=False)
+    content = json.loads(path.read_text()) | says
+    content |= {"k1": 0.1, "k2": 0.02, "k3": -0.03, "k4": 0.004}
+    path.write_text(json.dumps(content))
+    camera = read_calibration(path).cameras["cam0"]
+    assert camera.fisheye
+    assert camera.dist[:4].tolist() == [0.1, 0.02, -0.03, 0.004]
+
+
 def test_the_camera_looks_along_minus_z_in_nerfstudio(tmp_path):
     """A camera at (0, 0, 4) without rotation sees the origin in its centre, y up."""
     pose = np.eye(4)
@@ -247,8 +272,7 @@ def test_the_camera_looks_along_minus_z_in_nerfstudio(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
-        ({"is_fisheye": True}, "fisheye.*True"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "THIN_PRISM_FISHEYE"),
         ({"k4": 0.1}, "'k4'"),
         ({"frames": []}, "frames"),
         ({"frames": [{"transform_matrix": []}]}, "file_path"),

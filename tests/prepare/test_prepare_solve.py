@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from capture_scenes import LENS, no_outlines, outlines, ring, seen, turned
+from capture_scenes import (
+    ANGLES,
+    LENS,
+    no_outlines,
+    outlines,
+    ring,
+    seen,
+    turned,
+)
 from make import distorted_pixels, skeletons
 
 from gsgan.prepare import triangulate
@@ -243,6 +251,13 @@ def test_an_exact_calibration_is_kept_although_landmarks_are_biased():
     found = found_by(rig, uv, conf, silhouettes)
     assert found.cameras is rig
     assert found.frontier[0] < 1
+
+
+def test_silhouettes_of_few_pixels_do_not_move_an_exact_calibration():
+    """Outlines of small images are off by parts of a pixel, which refined cameras would fit."""
+    rig, _, uv, conf = seen(ring(ANGLES[:3], size=(96, 128)), frames=40)
+    found = found_by(rig, uv, conf, outlines(np.floor(uv) + 0.5))
+    assert found.cameras is rig
 
 
 @pytest.mark.parametrize("moved", [[1], [0, 1, 2, 3]])

@@ -211,7 +211,7 @@ def test_a_run_without_its_dataset(render, bare, motion, tmp_path):
     config.write_text(
         config.read_text().replace("root: /", "root: /no/longer/there/")
     )
-    ok = render(f"run={copy}", f"motion={motion}", "out=a", "frames=1")
+    ok = render(f"run={copy}", f"motion={motion}", "out=1.5", "frames=1")
     assert ok.returncode == 0, ok.stderr
 
 

@@ -3,6 +3,7 @@
 import base64
 import re
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ from scipy.spatial import cKDTree
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.body.free import free_body
+from gsgan.motion.gltf_file import DRACO, GltfFile
 from gsgan.motion.humanoid import mixamo_bone, vrm_bone
+from gsgan.motion.standard import known_joints
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
-from gsgan.synthetic.textures import srgb
+from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
 VALID = Path(__file__).resolve().parents[3] / "shared" / "data" / "valid"
@@ -236,6 +239,18 @@ RIGIFY = {
     "Neck": "DEF-spine.004",
     "Head": "DEF-spine.006",
 }
+UNREAL = {
+    "Hips": "pelvis",
+    "Spine": "spine_01",
+    "Neck": "neck_01",
+    "Head": "head",
+}
+CREATOR = {
+    "Hips": "CC_Base_Hip",
+    "Spine": "CC_Base_Waist",
+    "Neck": "CC_Base_NeckTwist01",
+    "Head": "CC_Base_Head",
+}
 BIPED = {
     "Hips": "Bip01 Pelvis",
     "Spine": "Bip01 Spine",
@@ -243,24 +258,165 @@ BIPED = {
     "Head": "Bip01 Head",
 }
 for _side in ("Left", "Right"):
-    for _bone, _rigify, _biped in (
-        ("Arm", "upper_arm", "UpperArm"),
-        ("ForeArm", "forearm", "Forearm"),
-        ("Hand", "hand", "Hand"),
-        ("UpLeg", "thigh", "Thigh"),
-        ("Leg", "shin", "Calf"),
-        ("Foot", "foot", "Foot"),
+    for _bone, _rigify, _biped, _unreal, _creator in (
+        ("Arm", "upper_arm", "UpperArm", "upperarm", "Upperarm"),
+        ("ForeArm", "forearm", "Forearm", "lowerarm", "Forearm"),
+        ("Hand", "hand", "Hand", "hand", "Hand"),
+        ("UpLeg", "thigh", "Thigh", "thigh", "Thigh"),
+        ("Leg", "shin", "Calf", "calf", "Calf"),
+        ("Foot", "foot", "Foot", "foot", "Foot"),
     ):
         RIGIFY[_side + _bone] = f"DEF-{_rigify}.{_side[0]}"
         BIPED[_side + _bone] = f"Bip01 {_side[0]} {_biped}"
-SKETCHFAB = {bone: f"mixamorig:{bone}_0{k}" for k, bone in enumerate(BONES)}
+        UNREAL[_side + _bone] = f"{_unreal}_{_side[0].lower()}"
+        CREATOR[_side + _bone] = f"CC_Base_{_side[0]}_{_creator}"
+BIP001 = {b: n.replace("Bip01 ", "Bip001_") for b, n in BIPED.items()}
+SANITISED = {b: re.sub("[.]", "", n) for b, n in RIGIFY.items()}
+MIXAMO = {bone: f"mixamorig:{bone}" for bone in BONES}
+STYLES = {
+    "Rigify": RIGIFY, "three.js": SANITISED, "Biped": BIPED, "Biped 001": BIP001,
+    "Unreal": UNREAL, "Character Creator": CREATOR, "Mixamo": MIXAMO,
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("names", [RIGIFY, BIPED, SKETCHFAB])
-def test_names_of_motions_are_those_of_characters(tmp_path, names, tiny):
+@pytest.mark.parametrize("sketchfab", [False, True], ids=["", "Sketchfab"])
+@pytest.mark.parametrize("style", STYLES)
+def test_names_of_motions_are_those_of_characters(
+    tmp_path, style, sketchfab, tiny
+):
+    names = STYLES[style]
+    if sketchfab:
+        names = {
+            bone: f"{name}_0{k}" for k, (bone, name) in enumerate(names.items())
+        }
+    known = known_joints(tuple(names.values()))
+    limbs = {bone for bone in BONES if bone not in ("Spine", "Neck")}
+    assert {list(names)[place]: bone for bone, place in known.items()} == {
+        bone: bone for bone in limbs
+    }
     character = read_character(TinyGlb(names=names).write(tmp_path / "a.glb"))
     assert set(character.bones) == set(BONES)
     np.testing.assert_allclose(character.vertices, tiny.vertices, atol=1e-6)
+
+
+def test_further_segments_meshes_and_fingers_are_no_limbs(tmp_path, tiny):
+    """Blender writes children first: the second half of an arm comes before the first one."""
+    assert known_joints(("DEF-thigh.L.001", "DEF-thigh.L")) == {"LeftUpLeg": 1}
+    fingers = ("Bip001 L Finger0", "Bip001 L Finger11", "Bip001 L Finger0Nub")
+    assert known_joints(fingers) == {"LeftHandThumb1": 0, "LeftHandIndex2": 1}
+    unreal = ("index_metacarpal_l", "index_01_l", "upperarm_twist_01_l")
+    assert known_joints(unreal) == {"LeftHandIndex1": 1}
+    glb = TinyGlb(names=UNREAL)
+    glb.doc.nodes[-1].name = "head"
+    glb.doc.nodes.insert(0, glb.doc.nodes.pop())
+    for node in glb.doc.nodes:
+        node.children = [child + 1 for child in node.children or ()]
+    glb.doc.skins[0].joints = [joint + 1 for joint in glb.doc.skins[0].joints]
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(character.joints, tiny.joints, atol=1e-6)
+
+
+def test_emission_adds_to_colours_and_unlit_materials_are_named(
+    tmp_path, caplog
+):
+    glb = TinyGlb()
+    material = glb.doc.materials[0]
+    material.emissiveFactor = [0.0, 0.5, 1.0]
+    strength = {"emissiveStrength": 0.5}
+    material.extensions = {"KHR_materials_emissive_strength": strength}
+    glb.doc.extensionsUsed = ["KHR_materials_unlit"]
+    plain = read_character(glb.write(tmp_path / "a.glb")).surfaces[0].colour
+    light = linear(np.array([200, 150, 120]) / 255)
+    light = light + np.array([0, 0.25, 0.5])
+    expected = 255 * srgb(light.clip(0, 1))
+    np.testing.assert_allclose(plain[0, 0, :3], expected, atol=1)
+    assert "KHR_materials_unlit" in caplog.text
+
+    # A black person whose colours are emitted, by a texture of its own size.
+    material.emissiveFactor = [1.0, 1.0, 1.0]
+    material.extensions = {}
+    shader = material.pbrMetallicRoughness
+    shader.baseColorTexture = None
+    shader.baseColorFactor = [0.0, 0.0, 0.0, 1.0]
+    image = Image.fromarray(np.full((8, 4, 3), (10, 90, 170), np.uint8))
+    number = glb.texture(image, "PNG")
+    material.emissiveTexture = pygltflib.TextureInfo(index=number)
+    colour = read_character(glb.write(tmp_path / "a.glb")).surfaces[0].colour
+    assert colour.shape == (8, 4, 4)
+    assert (abs(colour[..., :3] - np.array([10, 90, 170])) <= 1).all()
+
+
+# 8 x 4 pixels, red on the left and blue on the right, by the encoder of Basis Universal (ETC1S).
+KTX2 = zlib.decompress(
+    base64.b85decode(
+        "c-mX-9TK5nWU!l;ONxsD2pEBw1Bh7|5P%U0X8^Gd5KjSO6(HULRnrNj9T^dNkbw@AW@6A_Sj@=8z|0J>2LkNjtp7kD"
+        "52S(4Dlf_`NiAY<N-WMSRtU|@EK4maPRvm-(laywnZv}O3slDm#M)?fA=@o}zy-o6N@VVkRsgXy<qfzP)F7e)><2_3>"
+        "Vw$k@P&kihW-UQfSutWRM)3?UxpbB0wAV?3{VpbL=%HBM4Cf^K>z?jG9=a"
+    )
+)
+
+
+def test_textures_of_basis_universal_are_read(tmp_path, monkeypatch):
+    pytest.importorskip(
+        "opengl_basisu", reason="the extra gltf is not installed"
+    )
+    path = tmp_path / "a.glb"
+    glb = TinyGlb()
+    view = glb.view(KTX2)
+    glb.doc.images[0] = pygltflib.Image(bufferView=view, mimeType="image/ktx2")
+    packed = {"KHR_texture_basisu": {"source": 0}}
+    glb.doc.textures = [pygltflib.Texture(extensions=packed)]
+    glb.doc.extensionsRequired.append("KHR_texture_basisu")
+    image = read_character(glb.write(path)).surfaces[0].colour
+    np.testing.assert_allclose(image[0, 0], [200, 40, 40, 255], atol=5)
+    np.testing.assert_allclose(image[3, 7], [20, 90, 160, 255], atol=5)
+    monkeypatch.setitem(sys.modules, "opengl_basisu", None)
+    with pytest.raises(DataError, match=r"pip install 'gsgan\[gltf\]'"):
+        read_character(path)
+
+
+def draco(glb: TinyGlb, plain: Path) -> None:
+    """Packs the primitive, which the file ``plain`` has too; its accessors keep no bytes."""
+    import DracoPy
+
+    file = GltfFile(glb.write(plain))
+    primitive = glb.doc.meshes[0].primitives[0]
+    given = primitive.attributes
+    joints = file.accessor(given.JOINTS_0).astype("u1")
+    weights = np.rint(255 * file.accessor(given.WEIGHTS_0)).astype("u1")
+    corners = file.accessor(primitive.indices).astype("u4")
+    data = DracoPy.encode(
+        file.accessor(given.POSITION).astype("f4"),
+        faces=corners.reshape(-1, 3),
+        quantization_bits=16,
+        preserve_order=True,
+        tex_coord=file.accessor(given.TEXCOORD_0),
+        generic_attributes={10: joints, 11: weights},
+    )
+    kinds = {
+        attribute["attribute_type"]: attribute["unique_id"]
+        for attribute in DracoPy.decode(data).attributes
+    }
+    numbers = {"POSITION": kinds[0], "TEXCOORD_0": kinds[3]}
+    numbers |= {"JOINTS_0": 10, "WEIGHTS_0": 11}
+    packed = {"bufferView": glb.view(data), "attributes": numbers}
+    primitive.extensions = {DRACO: packed}
+    glb.doc.extensionsRequired.append(DRACO)
+    for name in numbers:
+        glb.doc.accessors[getattr(given, name)].bufferView = None
+    glb.doc.accessors[primitive.indices].bufferView = None
+
+
+def test_draco_is_decoded(tmp_path, tiny, monkeypatch):
+    pytest.importorskip("DracoPy", reason="the extra gltf is not installed")
+    path = tmp_path / "a.glb"
+    glb = TinyGlb()
+    draco(glb, tmp_path / "plain.glb")
+    character = read_character(glb.write(path))
+    np.testing.assert_allclose(character.vertices, tiny.vertices, atol=1e-3)
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    with pytest.raises(DataError, match=r"pip install 'gsgan\[gltf\]'"):
+        read_character(path)
 
 
 @pytest.mark.parametrize("version", [0, 1])
@@ -342,7 +498,7 @@ def a_nan(glb: TinyGlb) -> None:
     glb.blob[start : start + 4] = np.float32("nan").tobytes()
 
 
-BASISU = pygltflib.Texture(extensions={"KHR_texture_basisu": {"source": 0}})
+AVIF = pygltflib.Texture(extensions={"EXT_texture_avif": {"source": 0}})
 
 
 def coloured(glb: TinyGlb) -> np.ndarray:
@@ -369,13 +525,10 @@ BAD = {
     "NEW_thing is not supported": lambda glb: glb.doc.extensionsRequired.append(
         "NEW_thing"
     ),
-    "KHR_texture_basisu is not supported": lambda glb: setattr(
-        glb.doc, "textures", [BASISU]
+    "EXT_texture_avif is not supported": lambda glb: setattr(
+        glb.doc, "textures", [AVIF]
     ),
     "bake the colours into the texture": lambda glb: coloured(glb),
-    "draco": lambda glb: glb.doc.extensionsRequired.append(
-        "KHR_draco_mesh_compression"
-    ),
     "a face names a vertex": a_face_too_many,
     "not numbers": a_nan,
     "circle": lambda glb: setattr(glb.doc.nodes[3], "children", [0]),

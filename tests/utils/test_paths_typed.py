@@ -39,6 +39,7 @@ ODD = (
 
 # Keys whose comments name files though they are none.
 TEXT = (
+    "align",
     "frames",
     "motion_fps",
     "figures",

@@ -1,8 +1,10 @@
 """Web pages other than the viewer's own cannot connect to it."""
 
+import gzip
+
 import pytest
 
-from gsgan.view.guard import guarded, refusal
+from gsgan.view.guard import guarded, refusal, with_probe
 
 HOST = "127.0.0.1:8080"
 
@@ -63,6 +65,37 @@ def test_the_named_origin_may_connect(host, forwarded):
             is None
         )
     assert refusal(host, "https://other", "127.0.0.1", "https://name")
+
+
+def test_a_page_whose_connection_is_refused_says_why(chromium):
+    """A proxy that keeps the page's address to itself: the page loads, its connection does not."""
+    viser = pytest.importorskip(
+        "viser", reason="the extra view is not installed"
+    )
+    with guarded("127.0.0.1"):
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    port = server.get_port()
+    page = chromium.new_page()
+    try:
+        own = f"http://127.0.0.1:{port}"
+        page.route(
+            "http://studio.example/",
+            lambda route: route.fulfill(response=route.fetch(url=own)),
+        )
+        page.goto("http://studio.example/")
+        page.wait_for_selector("text=origin=http://studio.example")
+        page.goto(own)
+        assert "origin=" not in page.inner_text("body")
+    finally:
+        page.close()
+        server.stop()
+
+
+def test_the_page_holds_no_code_of_a_request():
+    page = with_probe(b"<html>", '</script>"', None, zipped=False).decode()
+    assert page.count("</script>") == 1
+    packed = with_probe(gzip.compress(b"<html>"), HOST, None, zipped=True)
+    assert HOST in gzip.decompress(packed).decode()
 
 
 def test_visers_server_refuses_them():

@@ -70,7 +70,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     window = person_window(view, joints[drawn], camera.size)
     mapping = None
     if camera.distorted:
-        mapping = undistort_map(camera.K, camera.dist, window)
+        mapping = undistort_map(camera, window)
     size = (TILE_HEIGHT, round(TILE_HEIGHT * ASPECT))
 
     def shown(image: Bytes) -> Bytes:

@@ -60,10 +60,9 @@ def check_data(
     except DataError as error:
         # The reader stops at the first problem; captures are searched for all.
         messages = [str(error)]
-        if isinstance(data.reader, CaptureReader) and data.root is not None:
-            messages += capture_problems(
-                Path(data.root).expanduser(), data.limits, messages
-            )
+        folder = Path(str(data.root)).expanduser()
+        if isinstance(data.reader, CaptureReader) and folder.is_dir():
+            messages += capture_problems(folder, data.limits, messages)
         return unreadable(data.root, messages)
     return CheckReport(
         str(measured.subject.layout.root),

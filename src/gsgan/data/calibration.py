@@ -2,7 +2,7 @@
 Qualisys, and by their name: COLMAP.
 
 cameras.json is the bring-your-own layout's calibration:
-``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
+``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h], fisheye false}}``
 """
 
 import re
@@ -290,6 +290,7 @@ def read_cameras(
             size=(int(height), int(width)),
             scale=conventions.scale,
             pixel_centre=conventions.pixel_centre,
+            fisheye=bool(entry.get("fisheye")),
         )
     return cameras
 
@@ -417,12 +418,6 @@ def _toml_camera(
                 f"{where} lacks '{key}'; expected {', '.join(TOML_KEYS)}"
             )
 
-    # Fisheye lenses have another model of distortion.
-    if entry.get("fisheye"):
-        raise DataError(
-            f"{where} is a fisheye camera, which is not supported; undistort its video and "
-            "calibrate it without distortion"
-        )
     width, height = numbers(where, entry["size"], "size", (2,))
 
     # A rotation that is no matrix is a Rodrigues vector.
@@ -439,6 +434,7 @@ def _toml_camera(
         size=(int(height), int(width)),
         scale=scale,
         pixel_centre=pixel_centre,
+        fisheye=bool(entry.get("fisheye")),
     )
 
 

@@ -13,6 +13,7 @@ from gsgan.utils.errors import DataError
 
 # Numbers of coefficients that OpenCV's lens model can have.
 DISTORTION_LENGTHS = (4, 5, 8)
+FISHEYE_LENGTHS = (4,)  # of OpenCV's model of fisheye lenses
 # maximum entry of R Rᵀ - I
 ROTATION_TOLERANCE = 1e-3
 
@@ -41,8 +42,9 @@ class CameraEntry:
         K: ``[3, 3]`` pixels, pixel centres at +0.5.
         R: ``[3, 3]`` world to camera.
         t: ``[3]`` metres.
-        dist: ``[8]`` OpenCV order, zero-padded.
+        dist: ``[8]`` OpenCV order, zero-padded; of a fisheye lens k1 k2 k3 k4.
         size: ``(H, W)``.
+        fisheye: the lens is that of OpenCV's fisheye module, which bends even without coefficients.
     """
 
     name: str
@@ -51,6 +53,7 @@ class CameraEntry:
     t: Float
     dist: Float
     size: tuple[int, int]
+    fisheye: bool = False
 
     @property
     def centre(self) -> Float:
@@ -60,13 +63,14 @@ class CameraEntry:
 
     @property
     def distorted(self) -> bool:
-        """Whether any distortion coefficient is not zero."""
-        return bool(np.any(self.dist != 0))
+        """Whether the lens bends straight lines."""
+        return self.fisheye or bool(np.any(self.dist != 0))
 
     @property
     def keeps_lens(self) -> bool:
         """Whether `Camera` can hold its distortion: five coefficients at most."""
-        return self.distorted and not self.dist[5:].any()
+        few = not self.fisheye and not self.dist[5:].any()
+        return self.distorted and few
 
     def seen(
         self, window: Crop, size: tuple[int, int] | None, *, lens: bool
@@ -108,6 +112,7 @@ def make_camera(
     size: tuple[int, int],
     scale: float = 1.0,
     pixel_centre: float = 0.5,
+    fisheye: bool = False,
 ) -> CameraEntry:
     """A camera from raw calibration values (lists, columns, arrays), checked and converted.
 
@@ -117,10 +122,11 @@ def make_camera(
         K: ``[3, 3]``.
         R: ``[3, 3]`` world to OpenCV camera axes.
         t: 3 numbers in the file's unit.
-        dist: 0, 4, 5 or 8 numbers, or None.
+        dist: 0, 4, 5 or 8 numbers, or None; of a fisheye lens 4.
         size: ``(H, W)`` pixels.
         scale: metres in one unit of the file.
         pixel_centre: the centre of the first pixel in the file's K, 0 or 0.5.
+        fisheye: the lens is that of OpenCV's fisheye module.
 
     Raises:
         DataError: naming the camera and the problem.
@@ -152,7 +158,10 @@ def make_camera(
 
     # All lengths are in metres from here on.
     metres = numbers(where, t, "t", (3,)) * scale
-    return CameraEntry(name, K, R, metres, _lens(where, dist), size)
+    lens = _lens(
+        where, dist, FISHEYE_LENGTHS if fisheye else DISTORTION_LENGTHS
+    )
+    return CameraEntry(name, K, R, metres, lens, size, fisheye)
 
 
 def numbers(
@@ -192,17 +201,22 @@ def _short(raw: Any, limit: int = 120) -> str:
     return text if len(text) <= limit else text[:limit] + "…"
 
 
-def _lens(where: str, raw: Any) -> Float:
+def _lens(where: str, raw: Any, lengths: tuple[int, ...]) -> Float:
     """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none."""
     # Absent coefficients are 0.
     padded = np.zeros(8)
     if raw is None or (isinstance(raw, (list, tuple)) and not raw):
         return padded
     dist = as_floats(raw).reshape(-1)
-    if len(dist) not in DISTORTION_LENGTHS or not np.isfinite(dist).all():
+    if len(dist) not in lengths or not np.isfinite(dist).all():
+        counts = " or ".join(map(str, lengths))
+        order = (
+            "k1 k2 k3 k4"
+            if lengths == FISHEYE_LENGTHS
+            else "k1 k2 p1 p2 k3 ..."
+        )
         raise DataError(
-            f"{where}: dist must hold 4, 5 or 8 finite numbers (k1 k2 p1 p2 k3 ...), "
-            f"found {_short(raw)}"
+            f"{where}: dist must hold {counts} finite numbers ({order}), found {_short(raw)}"
         )
     # The order k1 k2 p1 p2 k3 k4 k5 k6 is the same for every length.
     padded[: len(dist)] = dist

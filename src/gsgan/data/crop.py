@@ -69,7 +69,8 @@ class PersonCrop:
         view: CameraEntry,
         joints: Float,
         usable: NDArray[np.bool_],
-        dist: Float | None = None,
+        *,
+        lens: bool = False,
     ) -> Crop:
         """The crop around the usable joints, clipped to the image, then made square.
 
@@ -79,12 +80,12 @@ class PersonCrop:
             view: the camera.
             joints: ``[J, 3]`` metres, world frame, finite.
             usable: ``[J]`` which of them count; joints behind the camera never do.
-            dist: ``[8]`` the lens if the image keeps its distortion; None for a pinhole.
+            lens: whether the image keeps its distortion.
         """
         # Joints in the image, as this image shows them.
         pixels, depth = project(view, joints)
-        if dist is not None:
-            pixels = through_lens(view.K, dist, pixels[:, 0], pixels[:, 1])
+        if lens:
+            pixels = through_lens(view, pixels[:, 0], pixels[:, 1])
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
@@ -134,8 +135,7 @@ def cut(image: Bytes, crop: Crop) -> Bytes:
 
 
 def undistort_map(
-    K: Float,
-    dist: Float,
+    camera: CameraEntry,
     crop: Crop,
 ) -> NDArray[np.float32]:
     """``[h, w, 2]`` where each pixel of an undistorted crop lies in the distorted image.
@@ -145,12 +145,12 @@ def undistort_map(
     the map points outside the image.
 
     Args:
-        K: ``[3, 3]``, pixel centres at +0.5.
-        dist: ``[8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6.
+        camera: with K of pixel centres at +0.5.
         crop: of the undistorted image.
     """
+    K = camera.K
     u, v = _grid(crop)
-    if K[0, 1] == 0:
+    if K[0, 1] == 0 and not camera.fisheye:
         # OpenCV's own function is ten times as fast, but ignores skew.
         stored = K.copy()
         stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
@@ -161,30 +161,34 @@ def undistort_map(
         size = crop.size[::-1]
         eye = np.eye(3)
         maps = cv2.initUndistortRectifyMap(
-            stored, dist, eye, seen, size, cv2.CV_32FC1
+            stored, camera.dist, eye, seen, size, cv2.CV_32FC1
         )
         pixels = np.stack(maps, axis=-1)
     else:
-        pixels = (through_lens(K, dist, u, v) - 0.5).astype(np.float32)
+        pixels = (through_lens(camera, u, v) - 0.5).astype(np.float32)
 
     # Beyond the fold the lens model shows points twice: those pixels stay empty.
-    limit = fold_radius(K, dist, crop)
+    limit = fold_radius(camera, crop)
     if limit is not None:
         x, y = _unproject(K, u, v)
         pixels[x * x + y * y > limit**2] = -1e4
     return np.asarray(pixels, np.float32)
 
 
-def distort(points: Float, dist: Float) -> Float:
+def distort(points: Float, dist: Float, fisheye: bool = False) -> Float:
     """``[..., 2]`` where a lens shows points ``[..., 2]`` of the z = 1 plane, by OpenCV.
 
     Args:
         points: x/z and y/z.
-        dist: ``[4, 5 or 8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6.
+        dist: ``[4, 5 or 8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6; of a fisheye k1 k2 k3 k4.
+        fisheye: the lens is that of OpenCV's fisheye module.
     """
     if points.size == 0:
         return points
     flat = points.reshape(-1, 2)
+    if fisheye:
+        shown = cv2.fisheye.distortPoints(flat[:, None], np.eye(3), dist[:4])
+        return np.asarray(shown, np.float64).reshape(points.shape)
     rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
 
     # A camera at the origin with K = I: its pixels are x/z and y/z.
@@ -193,37 +197,40 @@ def distort(points: Float, dist: Float) -> Float:
     return np.asarray(shown, np.float64).reshape(points.shape)
 
 
-def undistort(points: Float, dist: Float) -> Float:
-    """``[N, 2]`` the inverse of `distort`, accurate to `FOUND`; NaN beyond the fold."""
+def undistort(points: Float, dist: Float, fisheye: bool = False) -> Float:
+    """``[N, 2]`` the inverse of `distort`, accurate to `FOUND`; NaN beyond the fold, and where a
+    fisheye lens looks sideways or back."""
     if points.size == 0:
         return points
     eye = np.eye(3)
 
-    # Iterative, since the lens model has no inverse in closed form.
-    raw = _undistort(
-        points[:, None],
-        eye,
-        dist,
-        R=eye,
-        P=eye,
-        criteria=CONVERGED,
-    )
+    # Iterative, since the lens models have no inverse in closed form.
+    if fisheye:
+        raw = cv2.fisheye.undistortPoints(
+            points[:, None], eye, dist[:4], criteria=CONVERGED
+        )
+    else:
+        raw = _undistort(
+            points[:, None],
+            eye,
+            dist,
+            R=eye,
+            P=eye,
+            criteria=CONVERGED,
+        )
     found = raw[:, 0].astype(np.float64)
 
     # The iteration may end at a wrong point, so its result is distorted again and compared.
-    error = np.abs(distort(found, dist) - points).max(axis=1, keepdims=True)
+    again = distort(found, dist, fisheye)
+    error = np.abs(again - points).max(axis=1, keepdims=True)
     return np.asarray(np.where(error < FOUND, found, np.nan))
 
 
-def through_lens(
-    K: Float,
-    dist: Float,
-    u: Float,
-    v: Float,
-) -> Float:
+def through_lens(camera: CameraEntry, u: Float, v: Float) -> Float:
     """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
+    K = camera.K
     x, y = _unproject(K, u, v)
-    shown = distort(np.stack([x, y], axis=-1), dist)
+    shown = distort(np.stack([x, y], axis=-1), camera.dist, camera.fisheye)
     return shown @ K[:2, :2].T + K[:2, 2]
 
 
@@ -246,8 +253,7 @@ def _grid(crop: Crop) -> tuple[Float, Float]:
 
 
 def fold_radius(
-    K: Float,
-    dist: Float,
+    camera: CameraEntry,
     crop: Crop,
     samples: int = 256,
 ) -> float | None:
@@ -264,16 +270,18 @@ def fold_radius(
     bottom = crop.top + h - 0.5
     u = np.array([left, left, right, right])
     v = np.array([top, bottom, top, bottom])
-    x, y = _unproject(K, u, v)
+    x, y = _unproject(camera.K, u, v)
     radii = np.linspace(0, np.hypot(x, y).max(), samples)  # [samples]
 
     # The lens model folds back where the distorted radius no longer grows.
-    # without p1 and p2
-    radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)
+    # without p1 and p2, which a fisheye lens does not have
+    radial = camera.dist.copy()
+    if not camera.fisheye:
+        radial[2:4] = 0
     along_x = np.stack([radii, np.zeros(samples)], axis=-1)
 
     # Along one axis: without tangential terms all directions are alike.
-    shown = distort(along_x, radial)[:, 0]  # [samples]
+    shown = distort(along_x, radial, camera.fisheye)[:, 0]  # [samples]
     folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
 

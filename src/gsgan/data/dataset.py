@@ -199,8 +199,8 @@ class CaptureDataset(Dataset[Frame]):
             landmarks = self.layout.landmarks
             joints = landmarks.p[item[1]]
             seen = landmarks.visibility[item[1]] > 0
-            dist = camera.dist if self._raw(camera) else None
-            return self.crop.window(camera, joints, seen, dist)
+            lens = self._raw(camera)
+            return self.crop.window(camera, joints, seen, lens=lens)
 
         # A whole image is padded to a square.
         if self.size is not None:
@@ -224,7 +224,7 @@ class CaptureDataset(Dataset[Frame]):
         # No mapping is needed if the image stays as it is.
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None
-        return cropping.undistort_map(camera.K, camera.dist, window)
+        return cropping.undistort_map(camera, window)
 
     def _load(self, item: Item) -> DecodedImage:
         camera = self._entry(item)

@@ -23,8 +23,8 @@ from gsgan.data.validation import (
     drop_unseen,
     frames_of,
 )
-from gsgan.utils.errors import DataError
-from gsgan.utils.frame_files import FrameFiles, own_entries
+from gsgan.utils.errors import DataError, explained
+from gsgan.utils.frame_files import FrameFiles, entries, shifted_numbers
 
 # Masks by camera and frame.
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
@@ -164,7 +164,7 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     """The dataset's folder.
 
     Raises:
-        DataError: when it does not exist, naming the ``expected`` content, or a link leads out.
+        DataError: when it does not exist, naming the ``expected`` content, or a link is to nothing.
     """
     # A wrong path is the most frequent mistake, so the message says what is expected.
     folder = Path(root).expanduser()
@@ -175,27 +175,9 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
         raise DataError(
             f"data.root={root} {problem}; expected the folder that holds {expected}"
         )
-    # Refuses links that lead out.
-    own_entries(folder, folder)
+    # Names links to nothing.
+    entries(folder)
     return folder
-
-
-def _shifted_numbers(found: Found) -> list[str]:
-    """Notes on masks and landmarks whose numbers are those of the images but for their start."""
-    images = frames_of(found.images)
-    masks = sorted({frame for files in found.masks.values() for frame in files})
-    others = {"masks": masks, "landmarks": sorted(found.landmarks.p)}
-    notes = []
-    for what, numbers in others.items():
-        if len(numbers) != len(images) or numbers == images:
-            continue
-        first, other = images[0], numbers[0]
-        if [frame - first for frame in images] == [n - other for n in numbers]:
-            notes.append(
-                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
-                "alike, or every image gets what belongs to another moment"
-            )
-    return notes
 
 
 def assemble(found: Found, limits: Thresholds) -> Layout:
@@ -209,12 +191,19 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     cameras = found.cameras
     landmarks = found.landmarks
     calibration = found.calibration
-    notes = [*found.notes, *_shifted_numbers(found)]
+    masks = {frame for files in found.masks.values() for frame in files}
+    others = {"masks": masks, "landmarks": landmarks.p}
+    shifted = shifted_numbers(frames_of(found.images), others)
+    notes = [*found.notes, *shifted]
+    cause = None
+    if shifted:
+        cause = f"{root}: {shifted[0].removeprefix('doubtful: ')}"
 
     # Frames need a skeleton, and cameras must fit the skeletons.
-    images = drop_frames(
-        root, found.images, landmarks, found.poses, limits, notes
-    )
+    with explained(cause):
+        images = drop_frames(
+            root, found.images, landmarks, found.poses, limits, notes
+        )
     check_geometry(
         root, cameras, images, landmarks, limits, calibration, found.unit_hint
     )
@@ -224,7 +213,8 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     folders = {}
     for name in cameras:
         folders[name] = root / found.mask_folder.format(camera=name)
-    images = drop_unmasked(images, found.masks, folders, limits, notes)
+    with explained(cause):
+        images = drop_unmasked(images, found.masks, folders, limits, notes)
 
     # Labels of the images that are left; none at all is the same as a capture without labels.
     labels = {}

@@ -42,10 +42,13 @@ PINHOLES = (
     "OPENCV",
     "FULL_OPENCV",
 )
+FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 ONE_FOCAL = (
     "SIMPLE_PINHOLE",
     "SIMPLE_RADIAL",
     "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
 )  # with one focal length
 # of a 2D point in images.bin: x, y, and the number of the 3D point
 POINT_BYTES = 24
@@ -65,6 +68,7 @@ class Lens(NamedTuple):
     K: Float  # [3, 3], pixel centres at +0.5
     dist: Sequence[float]  # of OpenCV
     size: tuple[int, int]  # (H, W)
+    fisheye: bool = False
 
 
 class CalibratedImage(NamedTuple):
@@ -121,6 +125,7 @@ def fixed_cameras(
             dist=lens.dist,
             size=lens.size,
             scale=scale,
+            fisheye=lens.fisheye,
         )
     return cameras
 
@@ -258,10 +263,10 @@ def _lens(
     where: str, model: str, size: tuple[int, int], values: Sequence[float]
 ) -> Lens:
     """The intrinsics of a camera model with its parameters."""
-    if model not in PINHOLES:
+    if model not in PINHOLES + FISHEYES:
         raise DataError(
             f"{where}: the camera model {model} is not supported; expected one of "
-            f"{', '.join(PINHOLES)}"
+            f"{', '.join(PINHOLES + FISHEYES)}"
         )
     if len(values) != CAMERA_MODELS[model]:
         raise ValueError(f"{model} has {len(values)} parameters")
@@ -273,7 +278,7 @@ def _lens(
     if 0 < len(dist) < 4:  # radial terms alone
         dist = [*dist, 0, 0, 0][:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return Lens(K=K, dist=dist, size=size)
+    return Lens(K=K, dist=dist, size=size, fisheye=model in FISHEYES)
 
 
 def _text_lenses(path: Path) -> dict[int, Lens]:
@@ -423,11 +428,12 @@ def read_nerfstudio(path: Path, scale: float) -> dict[str, CameraEntry]:
 def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     """The intrinsics among the values of a frame and of the file."""
     model = values.get("camera_model", "OPENCV")
-    if model not in PINHOLES or values.get("is_fisheye"):
+    if model not in PINHOLES + FISHEYES:
         raise DataError(
-            f"{where}: the camera model {model} (fisheye: {bool(values.get('is_fisheye'))}) is not "
-            f"supported; expected one of {', '.join(PINHOLES)}"
+            f"{where}: the camera model {model} is not supported; expected one of "
+            f"{', '.join(PINHOLES + FISHEYES)}"
         )
+    fisheye = model in FISHEYES or bool(values.get("is_fisheye"))
 
     def value(key: str, default: float | None = None) -> float:
         if values.get(key, default) is None:
@@ -453,9 +459,10 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     K[0, 2] = value("cx", width / 2)
     K[1, 2] = value("cy", height / 2)
 
-    # OpenCV's fourth radial term is another one.
-    if value("k4", 0) != 0:
+    # A fisheye lens has four radial terms; OpenCV's fourth of other lenses is another one.
+    if value("k4", 0) != 0 and not fisheye:
         raise DataError(f"{where}: 'k4' is not supported; undistort the images")
-    dist = [value(key, 0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    keys = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3"
+    dist = [value(key, 0) for key in keys.split()]
     size = (0, 0) if unsized else (int(height), int(width))
-    return Lens(K=K, dist=dist, size=size)
+    return Lens(K=K, dist=dist, size=size, fisheye=fisheye)

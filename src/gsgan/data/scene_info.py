@@ -227,12 +227,13 @@ def _lenses(
     # Held-out cameras are those that do not train.
     training = [layout.cameras[name] for name in cameras]
     held_out = [layout.cameras[name] for name in tested]
-    # k4, k5 and k6
-    rational = [camera.dist[5:] for camera in training + held_out]
+    everyone = training + held_out
     return {
         "has_distortion": any(camera.distorted for camera in training),
         "held_out_distortion": any(camera.distorted for camera in held_out),
-        "has_rational_lens": bool(np.any(rational)),
+        "has_rational_lens": any(
+            camera.distorted and not camera.keeps_lens for camera in everyone
+        ),
     }
 
 

@@ -31,6 +31,9 @@ COMPONENT_TYPES = {
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Required by a file, this would change all that is read here.
 UNSUPPORTED = ("KHR_meshopt_compression",)
+DRACO = "KHR_draco_mesh_compression"
+BASISU = "KHR_texture_basisu"
+KTX2 = b"\xabKTX 20\xbb"  # at the start of its textures
 MAX_IMAGE_SIDE = 2048  # pixels a side
 # Errors of reading a damaged file.
 FILE_ERRORS = (
@@ -51,7 +54,6 @@ class GltfFile:
 
     Args:
         path: of the file.
-        unsupported: extensions without which it can be read only if they are not required.
         known: beginnings of the names of all extensions that it may require; None: any others.
 
     Raises:
@@ -61,7 +63,6 @@ class GltfFile:
     def __init__(
         self,
         path: Path,
-        unsupported: tuple[str, ...] = UNSUPPORTED,
         known: tuple[str, ...] | None = None,
     ) -> None:
         data = path.read_bytes()
@@ -78,14 +79,15 @@ class GltfFile:
         # A required extension that is ignored would give wrong positions.
         for name in self.doc.extensionsRequired or ():
             unknown = known is not None and not name.startswith(known)
-            if name in unsupported or unknown:
+            if name in UNSUPPORTED or unknown:
                 raise DataError(
                     f"{path}: {name} is not supported; export it without"
                 )
 
-        # Caches of the buffers and of their views.
+        # Caches of the buffers and of their views, and decoded accessors.
         self._buffers: dict[int, bytes] = {}
         self._views: dict[int, tuple[Any, int]] = {}
+        self._decoded: dict[int, Array] = {}
 
         # The parent of each node.
         self.above: dict[int, int] = {}
@@ -115,7 +117,9 @@ class GltfFile:
 
         # An accessor without a view is all zeros, which a sparse part may
         # replace.
-        if a.bufferView is None:
+        if index in self._decoded:
+            values = self._decoded[index]
+        elif a.bufferView is None:
             values = np.zeros((a.count, width), kind)
         else:
             values = self._rows(
@@ -137,6 +141,32 @@ class GltfFile:
             return cast(Array, np.maximum(values / np.iinfo(kind).max, -1.0))
         return values.astype(np.float64)
 
+    def decompress(self, primitive: Any) -> None:
+        """Decodes the arrays of a primitive, if KHR_draco_mesh_compression alone holds them."""
+        packed = (primitive.extensions or {}).get(DRACO)
+        positions = self.doc.accessors[primitive.attributes.POSITION]
+        if packed is None or positions.bufferView is not None:
+            return
+        try:
+            import DracoPy
+        except ImportError:
+            raise self._needs_package(DRACO) from None
+        data, _ = self._view(packed["bufferView"])
+        try:
+            mesh = DracoPy.decode(bytes(data))
+        except Exception as error:  # of DracoPy's own classes
+            raise ValueError(f"{DRACO}: {error}") from None
+        for name, number in packed["attributes"].items():
+            attribute = mesh.get_attribute_by_unique_id(number)
+            accessor = getattr(primitive.attributes, name)
+            self._decoded[accessor] = attribute["data"]
+        self._decoded[primitive.indices] = mesh.faces.reshape(-1, 1)
+
+    def _needs_package(self, extension: str) -> DataError:
+        return DataError(
+            f"{self.path} is compressed ({extension}): pip install 'gsgan[gltf]'"
+        )
+
     def image(self, texture: int) -> Bytes:
         """``[h, w, 4]`` sRGB and coverage of a texture, at most 2048 pixels a side; white if it has
         no image."""
@@ -146,7 +176,10 @@ class GltfFile:
                 "%s: texture %d has no image and is white", self.path, texture
             )
             return np.full((1, 1, 4), 255, np.uint8)
-        image = Image.open(io.BytesIO(content)).convert("RGBA")
+        if content.startswith(KTX2):
+            image = Image.fromarray(self._transcoded(content))
+        else:
+            image = Image.open(io.BytesIO(content)).convert("RGBA")
         image.thumbnail((MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
         return np.asarray(image)
 
@@ -156,6 +189,8 @@ class GltfFile:
         extensions = entry.extensions or {}
         webp = extensions.get("EXT_texture_webp", {})
         source = webp.get("source", entry.source)
+        if source is None:
+            source = extensions.get(BASISU, {}).get("source")
         if source is None:
             name = next(iter(extensions), "")
             if not name:
@@ -168,6 +203,16 @@ class GltfFile:
             return self._content(image.uri, "image")
         data, _ = self._view(image.bufferView)
         return bytes(data)
+
+    def _transcoded(self, content: bytes) -> Bytes:
+        """The pixels ``[h, w, 4]`` of a KTX2 texture of Basis Universal."""
+        try:
+            import opengl_basisu
+        except ImportError:
+            raise self._needs_package(BASISU) from None
+        texture = opengl_basisu.open(content)
+        shown = texture.transcode(opengl_basisu.Target.RGBA8)
+        return np.ascontiguousarray(shown.data)
 
     def _rows(
         self,
@@ -228,9 +273,7 @@ class GltfFile:
         try:
             from meshoptimizer import decoder
         except ImportError:
-            raise DataError(
-                f"{self.path} is compressed (EXT_meshopt_compression): pip install 'gsgan[gltf]'"
-            ) from None
+            raise self._needs_package("EXT_meshopt_compression") from None
 
         # The mode tells what the bytes hold.
         count = packed["count"]

@@ -32,6 +32,10 @@ HUMANOID_BONES = (
     *_on_both_sides(SIDE_BONES),
     *_on_both_sides(FINGER_BONE_NAMES),
 )
+# The number that ends a name, and the share of names with a number of their own in files of
+# Sketchfab.
+NUMBER = re.compile(r"_\d+$")
+SKETCHFAB_SHARE = 0.6
 # Mixamo's names by their lower-case form.
 CANONICAL = {bone.lower(): bone for bone in HUMANOID_BONES}
 
@@ -84,6 +88,15 @@ def vrm_bone(name: str, version: int) -> str | None:
     return f"{side}Hand{finger}{segments.index(match[2]) + 1}"
 
 
+def plain_names(names: Iterable[str | None]) -> list[str]:
+    """Names without the numbers that Sketchfab adds to those of all joints."""
+    given = [name or "" for name in names]
+    numbers = {match[0] for match in map(NUMBER.search, given) if match}
+    if len(numbers) <= SKETCHFAB_SHARE * sum(map(bool, given)):
+        return given
+    return [NUMBER.sub("", name) for name in given]
+
+
 def mixamo_bone(name: str) -> str | None:
     """Mixamo's name without prefix of a bone, None for other bones."""
     # Without namespaces and separators.
@@ -108,9 +121,8 @@ def humanoid_bones(
         bones = extensions["VRM"]["humanoid"]["humanBones"]
         pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
     else:
-        pairs = [
-            (node, mixamo_bone(name or "")) for node, name in enumerate(names)
-        ]
+        plain = plain_names(names)
+        pairs = [(node, mixamo_bone(name)) for node, name in enumerate(plain)]
 
     # The first node of each bone counts.
     found: dict[str, int] = {}

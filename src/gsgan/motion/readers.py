@@ -61,6 +61,14 @@ PART_KEYS = (
 ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans_world", "trans", "transl", "smpl_trans", "Th")
 GVHMR_KEY = "smpl_params_global"  # GVHMR's parameters in the world's axes
+# TRAM's names of SMPL's arrays, and of its moving camera, to the world, in camera.npy.
+TRAM_KEYS = {
+    "pred_rotmat": "poses",
+    "pred_trans": "trans",
+    "pred_shape": "betas",
+    "frame": "frame_id",
+}
+CAMERA_KEYS = ("world_cam_R", "world_cam_T")
 # Of the shape coefficients.
 SHAPE_KEYS = ("betas", "shapes")
 # Numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X.
@@ -188,11 +196,35 @@ def read_dictionary(path: Path, source: Source) -> Clip:
         raise DataError(
             f"{path} holds no dictionary; expected one of arrays, such as 'poses'"
         )
+    return _by_keys(path, content, source)
+
+
+def _by_keys(path: Path, content: dict[str, Any], source: Source) -> Clip:
+    """The motion in a dictionary, of which GVHMR nests its own, and TRAM names others."""
     content = content.get(GVHMR_KEY, content)
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: {GVHMR_KEY!r} must be a dictionary of arrays")
+    tram = "pred_rotmat" in content
+    if tram:
+        content = {
+            name: content[key]
+            for key, name in TRAM_KEYS.items()
+            if key in content
+        }
     arrays = {key: as_floats(content[key]) for key in ARRAYS if key in content}
     for key, values in arrays.items():
         if not values.size:
             raise DataError(f"{path}: {key!r} must be an array of numbers")
+
+    # TRAM's person is in the axes of its camera, whose way lies one folder above.
+    for folder in (path.parent, path.parent.parent):
+        camera = folder / "camera.npy"
+        if tram and "frame_id" in arrays and camera.is_file():
+            way = read_npy(camera)
+            frames = arrays["frame_id"].astype(np.int64)
+            for key in CAMERA_KEYS:
+                arrays[key] = as_floats(way[key])[frames]
+            break
     return _by_names(path, arrays, source)
 
 
@@ -208,12 +240,7 @@ def read_fits(folder: Path, source: Source) -> Clip:
     smallest id."""
     frames: dict[str, list[Any]] = {key: [] for key in FIT_KEYS}
     for path in json_files(folder).values():
-        content = read_json_value(path)
-        if isinstance(content, dict):
-            content = content.get("annots")
-        people = content if isinstance(content, list) else []
-        fits = [one for one in people if isinstance(one, dict)]
-        fits = [one for one in fits if set(FIT_KEYS) <= one.keys()]
+        fits = _fits(read_json_value(path))
         if not fits:
             raise DataError(
                 f"{path}: expected a fit of EasyMocap with {', '.join(FIT_KEYS)}"
@@ -229,28 +256,33 @@ def read_fits(folder: Path, source: Source) -> Clip:
     return _by_names(folder, arrays, source)
 
 
-def read_gvhmr(path: Path, source: Source) -> Clip:
-    """SMPL-X parameters in the world's axes, in the .pt file that GVHMR writes."""
+def _fits(content: Any) -> list[dict[str, Any]]:
+    """EasyMocap's fits of the people of one frame, in a file's content; empty for other content."""
+    if isinstance(content, dict):
+        content = content.get("annots")
+    people = content if isinstance(content, list) else []
+    people = [one for one in people if isinstance(one, dict)]
+    return [one for one in people if set(FIT_KEYS) <= one.keys()]
+
+
+def read_tensors(path: Path, source: Source) -> Clip:
+    """A dictionary of tensors, such as the SMPL-X parameters that GVHMR writes (.pt, .pth)."""
     # Tensors and plain values only: a file from somebody else cannot run code.
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         reason = str(error).partition("\n")[0]
         raise DataError(
-            f"{path} is not a readable .pt file of tensors ({reason}); save its "
+            f"{path} is not a readable file of tensors ({reason}); save its "
             f"{GVHMR_KEY!r} as arrays with numpy.savez"
         ) from None
-    parameters = content.get(GVHMR_KEY) if isinstance(content, dict) else None
-    if not isinstance(parameters, dict):
+    expected = {GVHMR_KEY, *TRAM_KEYS, *POSE_KEYS}
+    if not isinstance(content, dict) or not expected & content.keys():
         raise DataError(
-            f"{path} has no {GVHMR_KEY!r}; expected the hmr4d_results.pt of GVHMR"
+            f"{path} has no {GVHMR_KEY!r}; expected the hmr4d_results.pt of GVHMR, or a dictionary "
+            "of SMPL's 'poses' and 'trans'"
         )
-    arrays = {
-        key: value.numpy()
-        for key, value in parameters.items()
-        if key in ARRAYS and isinstance(value, torch.Tensor)
-    }
-    return _by_names(path, arrays, source)
+    return _by_keys(path, content, source)
 
 
 def _by_names(
@@ -476,15 +508,26 @@ def _smpl(
     theta = _for_model(np.nan_to_num(poses).reshape(F, -1, 3), model)
     moves = np.nan_to_num(moves)
 
+    # TRAM's camera moves; SMPL turns about the root joint, the camera about its own centre.
+    root = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
+    if CAMERA_KEYS[0] in arrays:
+        R, centre = (arrays[key] for key in CAMERA_KEYS)
+        turn = Rotation.from_matrix(R)
+        theta[:, 0] = (turn * Rotation.from_rotvec(theta[:, 0])).as_rotvec()
+        moves = turn.apply(moves + root) + centre - root
+
     # ZJU-MoCap turns the body about the origin, SMPL about the root joint.
     if "Rh" in arrays:
-        root = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
         theta[:, 0], moves = from_zju(theta[:, 0], moves, root)
 
     shapes = np.repeat(betas[None], F, axis=0)
     motion = smpl_motion.SmplMotion(np.arange(F), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~known] = np.nan
+    if "frame_id" in arrays:
+        rows, at = _in_time(path, arrays, F)
+        p = _at_times(p[rows], at, np.nan)
+        conf = _at_times(conf[rows], at, 0.0)
     return Clip(
         path=path, p=p, visibility=conf, fps=fps, up=None, unit="metres"
     )
@@ -612,6 +655,10 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     """
     # The list of frames is the whole file, or one entry of it.
     content = read_json_value(path)
+    if _fits(content):
+        raise DataError(
+            f"{path} is one frame of EasyMocap's fits; give their folder, motion={path.parent}"
+        )
     frames = content
     fps = None
     if isinstance(content, dict):
@@ -829,7 +876,8 @@ READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".pkl": read_dictionary,
     ".npy": read_dictionary,
-    ".pt": read_gvhmr,
+    ".pt": read_tensors,
+    ".pth": read_tensors,
     ".smpl": read_meshcapade,
     ".json": read_mediapipe_json,
     **dict.fromkeys(RIGS, _read_rig),

@@ -13,8 +13,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from gsgan.motion.humanoid import plain_names
 from gsgan.motion.rig import (
     ARM,
+    FINGERS,
     LEG,
     REQUIRED,
     SIDES,
@@ -61,8 +63,8 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
-# Rigify numbers the bones of the trunk, from the hips to the head.
-RIGIFY = {"DEF-spine": "Hips", "DEF-spine.006": "Head"}
+# Rigify numbers the bones of the trunk, from the hips to the head; separators do not count.
+RIGIFY = {"DEFspine": "Hips", "DEFspine006": "Head"}
 # Regular expressions of the fingers' names.
 FINGER_ALIASES = {
     "Thumb": "thumb",
@@ -89,7 +91,7 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     """
     found: dict[str, int] = {}
     ranks: dict[str, int] = {}
-    for j, name in enumerate(names):
+    for j, name in enumerate(plain_names(names)):
         # MakeHuman's helpers and end sites are no bones.
         if name.startswith("__") or name.endswith(" end"):
             continue
@@ -103,9 +105,10 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
 def _bone(name: str) -> tuple[str, int]:
     """The bone that a joint's name means, and the rank of this alias; ("", 0) for other names."""
     _, _, plain = name.rpartition(":")
-    if plain in RIGIFY:
-        return RIGIFY[plain], 0
-    plain = plain.removeprefix("DEF-")
+    rigify = RIGIFY.get(re.sub(r"[\W_]", "", plain))
+    if rigify:
+        return rigify, 0
+    plain = re.sub(r"^DEF[-_]", "", plain)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", plain)
 
     # The side is a word of its own, or the beginning of the first word.
@@ -122,6 +125,13 @@ def _bone(name: str) -> tuple[str, int]:
     if not side and match and _stem(match[2], sided=True)[0]:
         side, stem = match.groups()
 
+    # Biped numbers fingers from the thumb, and their bones after that.
+    match = re.fullmatch(r"bip\d*finger([0-4])([12]?)", stem)
+    if match and side:
+        number = int(match[2] or 0) + 1
+        finger = FINGERS[int(match[1])]
+        return f"{SIDE_WORDS[side]}Hand{finger}{number}", 0
+
     # Prefixes of Mixamo, VRoid and Character Creator.
     stem = re.sub(r"^(mixamorig|j?bip|ccbase)\d*(c(?=hips|head))?", "", stem)
     bone, rank = _stem(stem, sided=bool(side))
@@ -137,7 +147,8 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
         ranked = aliases.split()
         in_middle = bone in ("Hips", "Head")
         if plain in ranked and sided != in_middle:
-            return bone, ranked.index(plain)
+            # Names with a number come after those without: they may be further segments.
+            return bone, 2 * ranked.index(plain) + (plain != stem)
 
     # Fingers have a number, or the name of a part.
     if not sided:
@@ -148,7 +159,8 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
         match = re.fullmatch(pattern, stem)
         if match:
             number = match[1] or PHALANX_NUMBERS.get(match[2], 1)
-            return f"Hand{finger}{number}", 0
+            inside_palm = match[2] == "metacarpal" and finger != "Thumb"
+            return f"Hand{finger}{number}", int(inside_palm)
     return "", 0
 
 

@@ -142,7 +142,7 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     # Rays at a depth of 1, where the lens has its distortion.
     homogeneous = np.c_[px[seen], np.ones(seen.sum())]
     rays = homogeneous @ np.linalg.inv(camera.K).T
-    straight = undistort(rays[:, :2], camera.dist)
+    straight = undistort(rays[:, :2], camera.dist, camera.fisheye)
 
     # Back to pixels by the same K.
     result = np.full(px.shape, np.nan)

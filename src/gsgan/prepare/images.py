@@ -31,7 +31,13 @@ def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
     K = camera.K.copy()
     K[0] *= w / W
     K[1] *= h / H
-    return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
+    return replace(
+        camera,
+        K=K,
+        dist=np.zeros_like(camera.dist),
+        size=(h, w),
+        fisheye=False,
+    )
 
 
 def find_masks(
@@ -116,7 +122,7 @@ def write_images(
     size = scaled(camera, scale).size
     mapping = None
     if camera.distorted:
-        mapping = undistort_map(camera.K, camera.dist, window)
+        mapping = undistort_map(camera, window)
 
     # A recording may change its size in between.
     def write(path: Path, pixels: Bytes, number: int, where: Path) -> None:

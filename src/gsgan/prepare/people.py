@@ -57,11 +57,7 @@ def one_person(
     Raises:
         DataError: when the people of the cameras can hardly ever be joined.
     """
-    several = {
-        number + int(offsets.get(name, 0))
-        for name, found in detections.items()
-        for number in found.crowded
-    }
+    several = crowded_frames(detections, offsets)
     if not several:
         return dict(detections), []
 
@@ -105,6 +101,17 @@ def one_person(
     if failed:
         note += f", and nobody in {len(failed)} frames in which they do not"
     return result, [note]
+
+
+def crowded_frames(
+    detections: Mapping[str, Detections], offsets: Mapping[str, int]
+) -> set[int]:
+    """The common numbers of frames in which any camera shows several people."""
+    several: set[int] = set()
+    for name, found in detections.items():
+        offset = int(offsets.get(name, 0))
+        several.update(number + offset for number in found.crowded)
+    return several
 
 
 def _only(found: Detections, chosen: Mapping[int, int]) -> Detections:

@@ -1,7 +1,7 @@
 """`gsgan.prepare`: videos in, a capture for `data=capture` out."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import one_person
+from gsgan.prepare.people import crowded_frames, one_person
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -55,14 +55,17 @@ from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
 from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import DataError, explained
 from gsgan.utils.files import read_json, write_json
+from gsgan.utils.frame_files import shifted_numbers
 from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
+TURNED = 1e-4  # degrees: less is rounding of cameras that were kept
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 DELAY = 0.5  # frames: larger delays of a clock are noted
+CORRECTED = 1.0  # frames: whole offsets leave up to half a frame
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
 
@@ -123,7 +126,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
         "notes": [
             *inputs.notes,
             *_camera_notes(solution, turned),
-            *_late_clocks(outcome),
+            *late_clocks(outcome).notes,
         ],
         "settings": outcome.options.record(),
     }
@@ -134,7 +137,7 @@ def _camera_notes(solution: Solution, turned: Float) -> list[str]:
     given, refined = solution.frontier
     if not np.isfinite(given):
         return []
-    if turned.any():
+    if turned.max() > TURNED:
         return [
             f"the cameras were refined: silhouettes of two cameras now agree within {refined:.2f} "
             f"pixels (median), with the given calibration {given:.2f}"
@@ -145,25 +148,34 @@ def _camera_notes(solution: Solution, turned: Float) -> list[str]:
     ]
 
 
-def _late_clocks(outcome: Outcome) -> list[str]:
+class LateClocks(NamedTuple):
+    """What is said of clocks."""
+
+    notes: list[str]
+    wrong: bool  # whether offsets would correct them
+
+
+def late_clocks(outcome: Outcome) -> LateClocks:
     """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
     # Delays are counted in the chosen frames, of which only every n-th may be there.
     solution = outcome.solution
     step = usual_step(outcome.frames)
     offsets = dict(outcome.options.offsets or {})
+    limit = CORRECTED if offsets else DELAY
     late = []
+    wrong = False
     for name, delay, gain in zip(
         outcome.inputs.sources, solution.delay, solution.gain, strict=True
     ):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
             late.append(f"{name} {step * delay:+.1f}")
+            wrong = wrong or abs(delay) > limit
             offsets[name] = offsets.get(name, 0) + round(step * delay)
     if not late:
-        return []
+        return LateClocks([], False)
     text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
-    return [
-        f"clocks seem late, in frames: {', '.join(late)}; if so, set offsets={{{text}}}"
-    ]
+    note = f"clocks seem late, in frames: {', '.join(late)}; set offsets={{{text}}}"
+    return LateClocks([note], wrong)
 
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
@@ -273,6 +285,7 @@ def prepare(options: Options, console: Console) -> Path:
     )
     write_files(root, outcome, key)
     numbers = summarise(outcome) | solved.numbers
+    numbers["clock_errors"] = _clock_errors(outcome, solved.drift)
     write_json(root / "prepare.json", numbers)
     publish(root, out)
 
@@ -285,7 +298,6 @@ def prepare(options: Options, console: Console) -> Path:
     check_capture(out, out / "check.html", console)
     print_summary(numbers, console)
     _refuse_errors(out)
-    _refuse_unsteady(out, solved.inputs, solved.drift)
     lines = (
         f"{out} is ready; look at {out / 'check.html'}, then",
         f"python -m gsgan.train data=capture data.root={out}",
@@ -330,14 +342,17 @@ def _from_several(
 ) -> Solved:
     """Several cameras: detections of one person, cameras in metres, joints in 3D."""
     found, masks = find_people(options, inputs.sources, stages, console.print)
+    inputs = _with_shifts(inputs, "masks", masks)
     inputs, masks = _with_times(options, inputs, masks, stages)
     inputs, detections = with_detections(inputs, found)
-    inputs, detections = _with_one_person(options, inputs, detections)
+    inputs, detections = with_one_person(options, inputs, detections)
     frames, uv, conf = _undistorted(options, inputs, detections)
 
     # Cameras that are not calibrated, or not in metres.
     if options.calibration == PERSON:
-        inputs = _from_person(options, inputs, frames, uv, conf, console)
+        people = [note for note in inputs.notes if "several people" in note]
+        with explained(people[-1] if people else None):
+            inputs = _from_person(options, inputs, frames, uv, conf, console)
     if not inputs.calibration.metric:
         inputs = _in_metres(options, inputs, uv, conf)
 
@@ -360,6 +375,24 @@ def _from_several(
     )
 
 
+def _with_shifts(
+    inputs: Inputs, what: str, numbers: Mapping[str, Iterable[int]]
+) -> Inputs:
+    """The inputs with notes on cameras whose files are numbered from another start than images.
+
+    Args:
+        inputs: the cameras.
+        what: the files.
+        numbers: of the files, by camera, counted as each camera's own images.
+    """
+    notes = [*inputs.notes]
+    for name, source in inputs.sources.items():
+        others = {f"its {what}": numbers[name]}
+        for note in shifted_numbers(source.numbers(), others):
+            notes.append(note.replace("doubtful: ", f"doubtful: {name}: "))
+    return replace(inputs, notes=notes)
+
+
 def with_detections(
     inputs: Inputs, found: Mapping[str, Path]
 ) -> tuple[Inputs, dict[str, Detections]]:
@@ -371,8 +404,10 @@ def with_detections(
     """
     notes = [*inputs.notes]
     detections = {}
+    numbers = {}
     for name in inputs.sources:
         read = landmarks.read_detections(found[name])
+        numbers[name] = read.frame_id.tolist()
         detections[name] = in_common(read, inputs.sources[name])
         for note in read.notes:
             notes.append(f"{name}: {note}")
@@ -386,7 +421,8 @@ def with_detections(
                     f"doubtful: {name}: several people were detected in {several} of {len(faces)} "
                     "frames; give landmarks and masks of one person if they are mixed up"
                 )
-    return replace(inputs, notes=notes), detections
+    noted = replace(inputs, notes=notes)
+    return _with_shifts(noted, "landmarks", numbers), detections
 
 
 def in_common(found: Detections, source: Recording) -> Detections:
@@ -407,16 +443,22 @@ def in_common(found: Detections, source: Recording) -> Detections:
     )
 
 
-def _with_one_person(
+def with_one_person(
     options: Options, inputs: Inputs, detections: dict[str, Detections]
 ) -> tuple[Inputs, dict[str, Detections]]:
     """The inputs with a note on other people, and detections of one person."""
-    # Cameras that are yet to be found cannot tell people apart.
+    offsets = options.offsets or {}
     if options.calibration == PERSON:
-        return inputs, detections
-    chosen, notes = one_person(
-        detections, inputs.cameras, options.offsets or {}
-    )
+        several = crowded_frames(detections, offsets)
+        if not several:
+            return inputs, detections
+        note = (
+            f"doubtful: several people were detected in {len(several)} frames; cameras that are "
+            "yet to be found cannot tell them apart, so in each the one with most confidence was "
+            "taken: leave one person in each file of landmarks"
+        )
+        return replace(inputs, notes=[*inputs.notes, note]), detections
+    chosen, notes = one_person(detections, inputs.cameras, offsets)
     return replace(inputs, notes=[*inputs.notes, *notes]), chosen
 
 
@@ -445,20 +487,31 @@ def _with_times(
     return in_time, renamed
 
 
-def _refuse_unsteady(out: Path, inputs: Inputs, drift: Float) -> None:
-    """Raises a DataError if a camera's clock ``drift [C]`` shows that it lost frames."""
-    for name, frames in zip(inputs.sources, drift, strict=True):
+def _clock_errors(outcome: Outcome, drift: Float) -> list[str]:
+    """A sentence for each camera whose clock is not steady, and one on clocks that are late.
+
+    Args:
+        outcome: of the command.
+        drift: ``[C]``, see `unsteady_clocks`.
+    """
+    errors = []
+    for name, frames in zip(outcome.inputs.sources, drift, strict=True):
         if abs(frames) > DRIFT:
-            raise DataError(
-                f"{out} was written, but the clock of {name} is {frames:+.1f} frames later at the "
-                "end than at the beginning, against the other cameras: it lost frames without a "
-                "gap in its time stamps, or runs at another rate; give folders of images, numbered "
-                "alike in all cameras, or use the part before with frames="
+            errors.append(
+                f"the clock of {name} is {frames:+.1f} frames later at the end than at the "
+                "beginning, against the other cameras: it lost frames without a gap in its time "
+                "stamps, or runs at another rate; give folders of images, numbered alike in all "
+                "cameras, or use the part before with frames="
             )
+    late = late_clocks(outcome)
+    return errors or (late.notes if late.wrong else [])
 
 
 def _refuse_errors(out: Path) -> None:
-    """Raises a DataError if the check of the dataset, in its check.json, has found errors."""
+    """Raises a DataError if the clocks of the dataset are wrong, or its check has found errors."""
+    clocks = read_json(out / "prepare.json").get("clock_errors")
+    if clocks:
+        raise DataError(f"{out} was written, but {'; '.join(clocks)}")
     findings = read_json(out / "check.json")["findings"]
     errors = []
     for finding in findings:

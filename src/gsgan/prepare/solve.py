@@ -54,6 +54,8 @@ MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
 # Refined cameras are taken if silhouettes are nearer to epipolar lines than this share of their
 # distance with the given ones, in frames that took no part.
 BETTER = 0.9
+# Pixels: silhouettes, which are of whole pixels, do not judge cameras by which they agree so well.
+PIXELATION = 0.5
 INFERRED = 0.1  # confidence of a joint that no two cameras see, but a body has
 SHOULDERS = [11, 12]
 
@@ -307,7 +309,8 @@ def refine(
     judging = [[one[f] for f in some[1::2]] for one in outlines]
     before = frontier_points(given, judging)
     error = float(np.nanmedian(before.error)) if before.uv.size else np.nan
-    if settings.refinements == 0 or before.uv.shape[1] < MIN_FRONTIER:
+    few = before.uv.shape[1] < MIN_FRONTIER
+    if settings.refinements == 0 or few or error <= PIXELATION:
         return Refined(given, (error, error))
 
     # The best of the refined cameras, by the frames between.

@@ -1,7 +1,7 @@
 """The recordings: one video or one folder of images per camera, and which camera took which."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from gsgan.data.cameras import CameraEntry
 from gsgan.utils.arrays import Bytes
 from gsgan.utils.errors import DataError
-from gsgan.utils.frame_files import frame_files, natural_order
+from gsgan.utils.frame_files import entries, frame_files, natural_order
 from gsgan.utils.image_files import read_colour, read_header
 
 VIDEO_SUFFIXES = (
@@ -70,6 +70,10 @@ class Recording:
             image = cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR)
             yield number, np.asarray(image, np.uint8)
 
+    def numbers(self) -> Iterable[int]:
+        """The images' own numbers; those of a video by its header, or none."""
+        return self.files or range(self.count or 0)
+
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
         parts: list[str | int] = []
@@ -109,10 +113,9 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
     """The recordings in a folder by name; other files do not count."""
     sources: dict[str, Recording] = {}
-    for path in sorted(
-        folder.iterdir(), key=lambda path: natural_order(path.name)
-    ):
-        if path.name.startswith("."):
+    for name in sorted(entries(folder), key=natural_order):
+        path = folder / name
+        if name.startswith("."):
             continue
 
         # A folder of images, or a video.

@@ -110,9 +110,10 @@ def _output(config: DictConfig) -> Output:
             "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
         )
 
-    # Every other ending is most likely a mistake.
+    # Every other ending is most likely a mistake; a number is none.
     out = Path(config.out).expanduser()
-    if out.suffix and out.suffix.lower() != ".mp4" and not out.is_dir():
+    usual = out.suffix.lower() in ("", ".mp4") or out.suffix[1:].isdecimal()
+    if not usual and not out.is_dir():
         raise ConfigError(
             f"out={out} must be a .mp4 file, or a folder for PNG files"
         )
@@ -205,8 +206,8 @@ def of_entry(
     if crop is not None:
         joints = p.reshape(-1, 3)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
-        dist = entry.dist if lens and entry.keeps_lens else None
-        window = crop.window(entry, joints, known, dist)
+        kept = lens and entry.keeps_lens
+        window = crop.window(entry, joints, known, lens=kept)
     return entry.seen(window, (size, size), lens=lens)
 
 

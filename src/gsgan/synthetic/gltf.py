@@ -8,14 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from PIL import Image
 from pygltflib import TextureInfo
 from scipy.spatial.transform import Rotation
 
 from gsgan.body.skinned import vertex_normals
 from gsgan.motion.character import Bytes, Character, Ints, Surface
 from gsgan.motion.gltf_file import (
+    BASISU,
+    DRACO,
     FILE_ERRORS,
-    UNSUPPORTED,
     GltfFile,
     local_matrix,
 )
@@ -51,10 +53,10 @@ UNIT_LENGTHS = (
     0.001,
     0.0254,
 )  # metres per unit of a file, likeliest first
-# Required by a file, these would change the meshes and textures that are read here.
-UNSUPPORTED_LOOKS = ("KHR_draco_mesh_compression", "KHR_texture_basisu")
 # Beginnings of the names of extensions that are applied, or change only how light is reflected.
 KNOWN = (
+    BASISU,
+    DRACO,
     "EXT_meshopt_compression",
     "EXT_texture_webp",
     "KHR_lights",
@@ -65,6 +67,8 @@ KNOWN = (
 )
 TRANSFORM = "KHR_texture_transform"
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+STRENGTH = "KHR_materials_emissive_strength"
+UNLIT = "KHR_materials_unlit"
 CHARACTER_FILES = (".glb", ".gltf", ".vrm")
 UPRIGHT = 0.7  # cosine between the way from hips to head and the vertical
 TRIANGLES = 4  # glTF's number of this primitive mode
@@ -94,7 +98,7 @@ def read_character(path: Path) -> Character:
             f"{path}: no such file; expected a rigged character as .glb"
         )
     try:
-        glb = GltfFile(path, (*UNSUPPORTED, *UNSUPPORTED_LOOKS), KNOWN)
+        glb = GltfFile(path, known=KNOWN)
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
@@ -116,15 +120,17 @@ class _Skeleton:
                 f"{glb.path}: no skin; expected a rigged character, export its bones"
             )
 
-        # Bones are the joints of all skins and the humanoid bones, parents first.
-        node_names = [node.name for node in self.nodes]
-        named = humanoid_bones(node_names, glb.doc.extensions or {})
+        # Bones are the joints of all skins and the humanoid bones, parents first. A mesh named as
+        # a bone is none.
+        joints = set().union(*(skin.joints for skin in skins))
+        names = []
+        for number, node in enumerate(self.nodes):
+            is_bone = node.mesh is None or number in joints
+            names.append((node.name or "") if is_bone else "")
+        named = humanoid_bones(names, glb.doc.extensions or {})
         if not set(REQUIRED_BONES) <= set(named.values()):
-            named = self._by_other_names() or named
-        used = set(named)
-        for skin in skins:
-            used.update(skin.joints)
-        self.ids = glb.parents_first(used)
+            named = self._by_other_names(tuple(names)) or named
+        self.ids = glb.parents_first(joints | set(named))
         self.number = {node: k for k, node in enumerate(self.ids)}
         self.bones = self._names(named)
 
@@ -157,32 +163,43 @@ class _Skeleton:
             self._worlds[node] = above @ local_matrix(self.nodes[node])
         return self._worlds[node]
 
-    def _by_other_names(self) -> dict[int, str]:
+    def _by_other_names(self, names: tuple[str, ...]) -> dict[int, str]:
         """Node number → Mixamo's bone name, by the names that motions have; the bones between the
-        hips and the head are spine and neck."""
-        names = tuple(node.name or "" for node in self.nodes)
+        hips and the head are spine, up to the arms, and neck."""
         found = known_joints(names)
-        if not {"Hips", "Head"} <= set(found):
+        if not {"Head", "LeftArm", "LeftUpLeg", "RightUpLeg"} <= set(found):
+            return {}
+        above = self.glb.ancestors
+
+        # Hips that are not above the head are not those of the legs.
+        head = above(found["Head"])
+        legs = set(above(found["LeftUpLeg"])) & set(above(found["RightUpLeg"]))
+        if found.get("Hips") not in head:
+            found["Hips"] = next((node for node in head if node in legs), -1)
+        if found["Hips"] < 0:
             return {}
         named = {node: bone for bone, node in found.items()}
-        trunk: list[int] = []
-        for node in self.glb.ancestors(found["Head"]):
-            if node == found["Hips"]:
+
+        # Biped's arms hang on its neck, which its name tells.
+        trunk = head[: head.index(found["Hips"])][::-1]
+        above_arm = above(found["LeftArm"])
+        spine = []
+        for node in trunk:
+            if node not in above_arm or "neck" in names[node].lower():
+                named[node] = "Neck"
                 break
-            trunk.insert(0, node)
-        if len(trunk) > 1:
-            named[trunk.pop()] = "Neck"
+            spine.append(node)
         for node, bone in zip(
-            trunk, ("Spine", "Spine1", "Spine2"), strict=False
+            spine, ("Spine", "Spine1", "Spine2"), strict=False
         ):
             named[node] = bone
 
         # A bone between the spine and an arm is a collarbone.
         for side in ("Left", "Right"):
             arm = found.get(f"{side}Arm")
-            above = None if arm is None else self.glb.above.get(arm)
-            if above is not None and above not in named:
-                named[above] = f"{side}Shoulder"
+            collar = None if arm is None else self.glb.above.get(arm)
+            if collar is not None and collar not in named:
+                named[collar] = f"{side}Shoulder"
         return named
 
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
@@ -245,6 +262,8 @@ def _part(
         k: v for k, v in vars(primitive.attributes).items() if v is not None
     }
 
+    glb.decompress(primitive)
+
     # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
     binding = _bound(glb, skeleton, number, attributes, len(position))
@@ -261,8 +280,10 @@ def _part(
     if len(corners) and corners.max() >= len(position):
         raise ValueError("a face names a vertex that is not there")
 
-    # Texture coordinates, of the set that the base colour uses.
+    # Texture coordinates, of the set that the base colour uses, or else the emission.
     base = _base_texture(glb, primitive.material)
+    if base is None and primitive.material is not None:
+        base = glb.doc.materials[primitive.material].emissiveTexture
     transform = (base and (base.extensions or {}).get(TRANSFORM)) or {}
     uv_set = transform.get("texCoord", (base and base.texCoord) or 0)
     uv = np.zeros((len(position), 2))
@@ -458,6 +479,7 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     factor = np.array(given or (1, 1, 1, 1), np.float64)
     if (factor != 1).any():
         colour = _scaled(colour, factor)
+    colour = _with_emission(glb, entry, base, colour)
 
     # Only materials that are not opaque are cut out by alpha.
     cutoff = 0.5 if entry.alphaCutoff is None else entry.alphaCutoff
@@ -479,14 +501,48 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     )
 
 
-def _refuse_other_transform(glb: GltfFile, normal: Any, base: Any) -> None:
-    """Refuses normals that lie elsewhere on the surface than colours: coordinates are shared."""
-    own = (normal.extensions or {}).get(TRANSFORM) or {}
+def _with_emission(
+    glb: GltfFile, entry: Any, base: Any, colour: Bytes
+) -> Bytes:
+    """Colours ``[H, W, 4]`` plus the light that a material emits, as far as a colour can show it.
+
+    Args:
+        glb: the file.
+        entry: the material.
+        base: the base colour's texture info, or None.
+        colour: of the material.
+    """
+    extensions = entry.extensions or {}
+    strength = extensions.get(STRENGTH, {}).get("emissiveStrength", 1.0)
+    factor = strength * np.array(entry.emissiveFactor or (0, 0, 0), np.float64)
+    if not factor.any():
+        return colour
+    emitted = np.full((1, 1, 4), 255, np.uint8)
+    if entry.emissiveTexture is not None:
+        _refuse_other_transform(glb, entry.emissiveTexture, base)
+        emitted = glb.image(entry.emissiveTexture.index)
+
+    # Both at the larger size; light is added.
+    height, width, _ = np.maximum(colour.shape, emitted.shape).tolist()
+    shown, added = (
+        np.asarray(Image.fromarray(image).resize((width, height)))
+        for image in (colour, emitted)
+    )
+    light = linear(shown[..., :3] / 255) + factor * linear(added[..., :3] / 255)
+    result = shown.copy()
+    result[..., :3] = np.rint(255 * srgb(np.clip(light, 0, 1)))
+    return result
+
+
+def _refuse_other_transform(glb: GltfFile, other: Any, base: Any) -> None:
+    """Refuses normals and light that lie elsewhere on the surface than colours: coordinates are
+    shared."""
+    own = (other.extensions or {}).get(TRANSFORM) or {}
     shared = (base and (base.extensions or {}).get(TRANSFORM)) or {}
     if base is not None and own != shared:
         raise DataError(
-            f"{glb.path}: {TRANSFORM} of a normal map differs from that of the base colour; give "
-            "both the same, or export without"
+            f"{glb.path}: {TRANSFORM} of a normal map or of emission differs from that of the base "
+            "colour; give both the same, or export without"
         )
 
 
@@ -614,6 +670,12 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
     plain = {part.material for part in parts if part.surface is None}
     materials = sorted(plain)
     surfaces = [_surface(glb, number) for number in materials]
+    if UNLIT in (glb.doc.extensionsUsed or ()):
+        logger.warning(
+            "%s: its unlit materials (%s) are lit as all others",
+            glb.path,
+            UNLIT,
+        )
     material = []
     for part in parts:
         if part.surface is None:

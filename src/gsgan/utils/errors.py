@@ -1,5 +1,8 @@
 """Errors that are shown to the user as one sentence, without a traceback."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class GsganError(Exception):
     """An error that the user can fix: the message names what, where and what to do."""
@@ -11,3 +14,14 @@ class DataError(GsganError):
 
 class ConfigError(GsganError):
     """A config value is unknown or contradicts another."""
+
+
+@contextmanager
+def explained(cause: str | None) -> Iterator[None]:
+    """Errors of data inside begin with their cause, if it is known."""
+    try:
+        yield
+    except DataError as error:
+        if cause is None:
+            raise
+        raise DataError(f"{cause}; {error}") from None

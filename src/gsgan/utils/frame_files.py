@@ -1,4 +1,4 @@
-"""The files of a dataset's folder by frame number, none of which lies outside the dataset."""
+"""The files of a dataset's folder by frame number."""
 
 import os
 import re
@@ -77,11 +77,10 @@ def frame_files(
             between the files.
 
     Raises:
-        DataError: when a name has no number, two names have the same, or a link leads out.
+        DataError: when a name has no number, two names have the same, or a link leads to nothing.
     """
-    # A folder that does not exist is the same as an empty one.
     place = root / folder
-    names = frozenset(own_entries(place, root) if place.is_dir() else ())
+    names = frozenset(entries(place))
     # The index is cached without its folder, so this camera gets a copy with its own.
     try:
         found = copy(_by_frame(names, suffixes, number))
@@ -125,30 +124,53 @@ def _by_frame(
     return FrameFiles("", found)
 
 
-def own_entries(folder: Path, root: Path) -> list[str]:
-    """The names in a dataset's folder.
+def entries(folder: Path) -> list[str]:
+    """The names in a dataset's folder, none if it does not exist. Links are followed: the dataset
+    is the user's own.
 
     Raises:
-        DataError: if the folder or an entry is a link to a place outside the dataset: a downloaded
-            dataset could then read any file of this machine.
+        DataError: if the folder or an entry is a link to nothing.
     """
-    # Places are compared without links and dots.
-    home = root.resolve()
-    with os.scandir(folder) as found:
-        entries = list(found)
-
-    # Only links can lead out, so only those are resolved.
-    links = [folder]
-    for entry in entries:
-        if entry.is_symlink():
-            links.append(Path(entry))
+    # Only links are looked up: folders may hold millions of files.
+    names = []
+    links = [folder] if folder.is_symlink() else []
+    if folder.is_dir():
+        with os.scandir(folder) as scanned:
+            for entry in scanned:
+                names.append(entry.name)
+                hidden = entry.name.startswith(".")
+                if entry.is_symlink() and not hidden:
+                    links.append(Path(entry))
     for link in links:
-        if not link.resolve().is_relative_to(home):
+        if not link.exists():
             raise DataError(
-                f"{link} is a link to {link.resolve()}, outside the dataset; copy the files into "
-                f"{root}, or mount their folder there"
+                f"{link} is a link to {link.readlink()}, which does not exist; is its disk mounted?"
             )
-    return [entry.name for entry in entries]
+    return names
+
+
+def shifted_numbers(
+    images: Iterable[int], others: Mapping[str, Iterable[int]]
+) -> list[str]:
+    """Notes on files whose numbers are those of the images but for their start.
+
+    Args:
+        images: their frame numbers.
+        others: those of other files, by what they are.
+    """
+    given = sorted(images)
+    notes = []
+    for what, numbers in others.items():
+        found = sorted(numbers)
+        if len(found) != len(given) or found == given:
+            continue
+        first, other = given[0], found[0]
+        if [frame - first for frame in given] == [n - other for n in found]:
+            notes.append(
+                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
+                "alike, or every image gets what belongs to another moment"
+            )
+    return notes
 
 
 def counting(stems: Iterable[str]) -> Callable[[str], int | None]:

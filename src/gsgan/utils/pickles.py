@@ -1,7 +1,8 @@
 """Reads pickled data, such as SMPL files and ``annots.npy``, without running code from the file.
 
 A pickle is a program that may call any function. `_Unpickler` gives it only the names in
-`ALLOWED`: they build numpy arrays, and stand-ins for the classes of chumpy and scipy.
+`ALLOWED`: they build numpy arrays, also of tensors, and stand-ins for the classes of chumpy and
+scipy.
 """
 
 import copyreg
@@ -157,6 +158,24 @@ def _from_buffer(
     )
 
 
+def _storage(content: bytes) -> Any:
+    import torch  # here: few files need it
+
+    return torch.load(
+        io.BytesIO(content), map_location="cpu", weights_only=True
+    )
+
+
+def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: Any) -> Any:
+    import torch
+
+    count = math.prod(size)
+    _expect(count * 8 <= LARGEST_ARRAY, f"a tensor of shape {tuple(size)}")
+    tensor = torch.empty(0, dtype=storage.dtype)
+    tensor.set_(storage._untyped_storage, offset, tuple(size), tuple(stride))
+    return tensor.double().numpy()
+
+
 def _encode(text: str, _encoding: str) -> bytes:
     return text.encode("latin1")
 
@@ -175,6 +194,9 @@ ALLOWED: dict[tuple[str, str], Any] = {
     ("chumpy.ch", "Ch"): _Chumpy,
     ("chumpy.reordering", "Select"): _Select,
     ("scipy.sparse.csc", "csc_matrix"): _Sparse,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch.storage", "_load_from_bytes"): _storage,
+    ("collections", "OrderedDict"): dict,
 }
 # Modules that other versions call by another name.
 RENAMED = {

@@ -1,6 +1,8 @@
 """Which requests the viewer's server answers: viser itself answers any web page."""
 
+import gzip
 import ipaddress
+import json
 import re
 import socket
 from collections.abc import Iterator
@@ -66,6 +68,43 @@ def refusal(
     return None
 
 
+# A page at another address than the request tries the connection that it needs, and says why it
+# gets none: browsers do not tell.
+PROBE = """<script>
+if (location.host !== HOST && location.origin !== ORIGIN) {
+  const probe = new WebSocket(location.href.replace(/^http/, "ws"));
+  probe.onopen = () => probe.close();
+  probe.onerror = () => {
+    document.body.innerText = "The viewer does not accept connections from this address. Start it "
+      + `with origin=${location.origin}; the proxy or port forwarding must pass WebSockets.`;
+  };
+}
+</script>"""
+
+
+def with_probe(
+    body: bytes, host: str, allowed: str | None, zipped: bool
+) -> bytes:
+    """The viewer's page with `PROBE` at its end.
+
+    Args:
+        body: HTML.
+        host: the request's ``Host``.
+        allowed: the option ``origin``.
+        zipped: whether the body is compressed by gzip.
+    """
+    text = PROBE
+    for word, value in (
+        ("HOST", host),
+        ("ORIGIN", (allowed or "").rstrip("/")),
+    ):
+        text = text.replace(word, json.dumps(value).replace("<", "\\u003c"))
+    probe = text.encode()
+    if not zipped:
+        return body + probe
+    return gzip.compress(gzip.decompress(body) + probe)
+
+
 def _first_name(forwarded: str | None) -> str:
     """The first name in ``X-Forwarded-Host``, which proxies append to; empty for none or an odd
     one."""
@@ -89,9 +128,19 @@ def guarded(served: str, allowed: str | None = None) -> Iterator[None]:
         origin = request.headers.get("Origin")
         forwarded = request.headers.get("X-Forwarded-Host")
         why = refusal(host, origin, served, allowed, forwarded)
-        if why is None:
-            return inner(connection, request)
-        return connection.respond(403, f"{why}\n")
+        if why is not None:
+            return connection.respond(403, f"{why}\n")
+        response = inner(connection, request)
+        kind = (
+            "" if response is None else response.headers.get("Content-Type", "")
+        )
+        if not kind.startswith("text/html"):
+            return response
+        zipped = response.headers["Content-Encoding"] == "gzip"
+        response.body = with_probe(response.body, host, allowed, zipped)
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
+        return response
 
     def serve(*args: Any, process_request: Any, **options: Any) -> Any:
         checked = partial(check, process_request)

@@ -55,7 +55,7 @@ from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json
-from gsgan.utils.frame_files import FrameFiles, frame_files
+from gsgan.utils.frame_files import FrameFiles, entries, frame_files
 from gsgan.utils.image_files import complete, read_header
 from gsgan.utils.pickles import read_arrays
 
@@ -367,9 +367,9 @@ def _index_images(
 
     # Hidden folders, such as those that file managers make, do not count.
     found = set()
-    for path in folder.iterdir():
-        if path.is_dir() and not path.name.startswith("."):
-            found.add(path.name)
+    for name in entries(folder):
+        if (folder / name).is_dir() and not name.startswith("."):
+            found.add(name)
 
     # A folder and a camera without each other are most likely misspelt.
     unknown = sorted(found - set(cameras))

@@ -197,7 +197,7 @@ def inside_share(
 
     # The points as the lens shows them, since stored masks are distorted.
     straight, depth = project(camera, joints)
-    shown = through_lens(camera.K, camera.dist, straight[:, 0], straight[:, 1])
+    shown = through_lens(camera, straight[:, 0], straight[:, 1])
     everyone = np.ones(len(joints), bool)
     distance = mask_distance(small)
     # [N]
