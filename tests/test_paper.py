@@ -17,7 +17,6 @@ OURS = {  # what gsgan adds to the paper's method, and the value that leaves it 
     "effects.antialias": "off",
     "effects.random_background": "off",
     "effects.registration": "off",
-    "effects.pose_corrections": "off",
     "effects.light": "off",
     "model.deformation.normals": False,
     "model.deformation.free_table": False,

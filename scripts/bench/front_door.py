@@ -480,8 +480,7 @@ def mix(truth: Path, prepared: Path, out: Path, rung: str) -> None:
                 alpha = cv2.imread(str(mask), 0)[..., None] / 255
                 image = np.round(image * alpha).astype(np.uint8)
             cv2.imwrite(str(target), image)
-    meta = json.loads((truth / "meta.json").read_text())
-    write_json(out / "meta.json", meta | {"detected": joints})
+    shutil.copy(truth / "meta.json", out / "meta.json")
 
 
 def train(data: Path, run: Path, overrides: list[str]) -> dict[str, float]:

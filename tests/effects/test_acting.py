@@ -169,7 +169,7 @@ def test_all_means_all_that_this_model_can_have(build):
         "colour_correction",
         "random_background",
     }
-    every |= {"body_points", "registration", "pose_corrections", "light"}
+    every |= {"body_points", "registration", "light"}
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar(*frame.inputs).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")

@@ -335,18 +335,3 @@ def test_a_run_is_not_resumed_with_other_effects():
     before.check_same(before.plain())
     with pytest.raises(ConfigError, match=r"effects\.random_background.* on"):
         now.check_same(before.plain())
-
-
-def test_poses_of_detected_skeletons_are_corrected_where_two_cameras_see_depth():
-    detected = {"body_inside": 1.0, "detected": True}
-    effect = decide(scene(**detected), EffectSettings()).pose_corrections
-    assert effect.on
-    assert "noisy" in effect.why
-    one = decide(
-        scene(**detected, n_train_cameras=1, train_cameras=CAMERAS[:1]),
-        EffectSettings(),
-    )
-    assert not one.pose_corrections.on
-    assert not decide(
-        scene(body_inside=1.0), EffectSettings()
-    ).pose_corrections.on

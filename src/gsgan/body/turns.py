@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsgan.scene import BodyPose
 
@@ -30,35 +30,3 @@ def turned(pose: BodyPose, moves: Tensor) -> BodyPose:
     theta = pose.theta + moves[:, :-1]
     transl = pose.transl + moves[:, -1]
     return replace(pose, theta=theta, transl=transl, bones=None)
-
-
-class PoseCorrections(nn.Module):
-    """Turns of the joints in each training frame, which are learned with the avatar.
-
-    Their mean over the frames is zero: a turn that all frames share would move the avatar away
-    from the skeletons that drive it later.
-
-    Args:
-        frames: numbers of the training frames.
-        joint_names: of the body.
-
-    Source: ours; poses are learned with the avatar in most methods for captures without markers.
-    """
-
-    frames: Tensor
-    scale: Tensor
-
-    def __init__(
-        self, frames: Sequence[int], joint_names: Sequence[str]
-    ) -> None:
-        super().__init__()
-        self.register_buffer("frames", torch.tensor(sorted(frames)))
-        scale = turn_scale(joint_names, METRES_PER_RADIAN)
-        self.register_buffer("scale", scale, persistent=False)
-        self.moves = nn.Parameter(torch.zeros(len(frames), len(scale), 3))
-
-    def forward(self, pose: BodyPose, frame_id: Tensor) -> BodyPose:
-        """The poses of the training frames ``[B]``, corrected."""
-        moves = (self.moves - self.moves.mean(0)) * self.scale
-        rows = torch.searchsorted(self.frames, frame_id)
-        return turned(pose, moves[rows])

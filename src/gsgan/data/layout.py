@@ -55,7 +55,6 @@ class Meta:
         up_axis: of the world, e.g. "z" or "-y".
         skeleton: name of the landmark set.
         skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
-        detected: landmarks were detected in the images, so they are inexact.
         label_names: names of the part numbers, background first, or None.
         splits: train_cameras, test_cameras, train_frames, test_frames of the dataset itself,
             unchecked.
@@ -67,7 +66,6 @@ class Meta:
     up_axis: str = "z"
     skeleton: str = "mediapipe33"
     skeleton_source: str = "mediapipe33"
-    detected: bool = False
     body: BodyModel | None = None
     label_names: tuple[str, ...] | None = None
     splits: Mapping[str, Any] = field(default_factory=dict)

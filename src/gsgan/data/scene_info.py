@@ -67,7 +67,6 @@ class SceneInfo:
             cameras' medians.
         surface: colour differences between training cameras on the same surface, or None if
             they share too little.
-        detected: landmarks were detected in the images.
         darkest: brightness in [0, 1] of the person's darkest percent.
         texture: mean over the person's pixels, without a margin, of `gsgan.data.texture.texture`.
         degrees_seen: of 360 around the person, from which training cameras see the training frames.
@@ -101,7 +100,6 @@ class SceneInfo:
     has_rational_lens: bool = False
     scale_train: tuple[float, float] = (1.0, 1.0)
     surface: SurfaceColours | None = None
-    detected: bool = False
     darkest: float = 0.0
     texture: float = 0.0
     degrees_seen: int = 0
@@ -170,7 +168,6 @@ def scene_info(
         n_train_cameras=len(cameras),
         has_labels=labelled and any(layout.label_path(*item) for item in items),
         has_body_pose=layout.poses is not None,
-        detected=layout.meta.detected,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,
         n_labels=count_labels(layout, items),

@@ -24,7 +24,6 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
     "registration": ON_OFF,
-    "pose_corrections": ON_OFF,
     "light": ON_OFF,
 }
 
@@ -56,7 +55,6 @@ class EffectSettings:
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
     registration: str | bool = AUTO
-    pose_corrections: str | bool = AUTO
     light: str | bool = AUTO
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
@@ -171,7 +169,7 @@ def decide(
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
     """
-    # Two effects depend on whether Gaussians are on a body; all others decide by themselves.
+    # Registration depends on whether Gaussians are on a body; all others decide by themselves.
     model = model or ModelParts()
     on_body = _one("body_points", info, settings, model)
     found = {
@@ -197,7 +195,7 @@ def _one(
     # Not possible in this scene or model. Lenses that cannot be rendered are undistorted.
     reason = _impossible(name, info, requested) or model.lacks(name)
     on_body = body_points is not None and body_points.on
-    if name in ("registration", "pose_corrections") and not on_body:
+    if name == "registration" and not on_body:
         reason = "no Gaussians are on a body"
     if reason is not None:
         if requested != AUTO and settings.impossible == "error":
@@ -361,17 +359,6 @@ def _registration(info: SceneInfo, settings: EffectSettings) -> Effect:
     return Effect("on", f"{measured} ({limit})")
 
 
-def _pose_corrections(info: SceneInfo, settings: EffectSettings) -> Effect:
-    # One camera sees no depth, in which corrections would drift.
-    if info.n_train_cameras < 2:
-        return Effect(OFF, "one training camera does not see depth")
-
-    # Skeletons are exact unless the data says how they were made.
-    if not info.detected:
-        return Effect(OFF, "meta.json does not say that joints were detected")
-    return Effect("on", "joints were detected in the images, so they are noisy")
-
-
 def _light(info: SceneInfo, settings: EffectSettings) -> Effect:
     # Seen from few sides, too few directions of normals are seen to find the light.
     measured = (
@@ -392,6 +379,5 @@ _RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "body_points": _body_points,
     "random_background": _random_background,
     "registration": _registration,
-    "pose_corrections": _pose_corrections,
     "light": _light,
 }

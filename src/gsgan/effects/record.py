@@ -50,7 +50,6 @@ class Effects:
         body_points: G lies on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares images over a random colour.
         registration: before Ψ learns, optical flow locates the surface in the training images.
-        pose_corrections: the body's pose in each training frame is learned with the avatar.
         light: colours are multiplied by a light that all points share.
         cameras: training cameras in the order of the colour corrections.
     """
@@ -63,7 +62,6 @@ class Effects:
     body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
     registration: Effect = _DEFAULT
-    pose_corrections: Effect = _DEFAULT
     light: Effect = _DEFAULT
     cameras: tuple[str, ...] = ()
 

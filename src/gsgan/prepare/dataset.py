@@ -102,7 +102,6 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        "detected": True,
         **({"background": "black"} if options.mattes else {}),
         "made_by": {
             "generator": MADE_BY,

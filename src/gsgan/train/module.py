@@ -13,7 +13,6 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from gsgan.body.turns import PoseCorrections
 from gsgan.losses.perceptual import Perceptual
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar
@@ -83,7 +82,6 @@ class AvatarTraining(LightningModule):
         rollback: recovers from a collapse of the rendered person.
         registration: of the body's surface to the training images, before the first iteration,
             if the avatar's effects have it.
-        pose_corrections: of the training frames, if the avatar's effects have them.
         extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
@@ -112,7 +110,6 @@ class AvatarTraining(LightningModule):
         average_every: int = 1,
         rollback: Rollback | None = None,
         registration: Registration | None = None,
-        pose_corrections: PoseCorrections | None = None,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
         scene: dict[str, Any] | None = None,
@@ -153,7 +150,6 @@ class AvatarTraining(LightningModule):
         # Where the surface of training frames is; known once it is registered.
         self.registration = registration or Registration()
         self.registered: Registered | None = None
-        self.pose_corrections = pose_corrections
 
         # Facts that checkpoints store.
         self.record = record or {}
@@ -259,15 +255,10 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
-        body = frame.body
         if self.registered is not None:
-            assert body is not None
+            assert frame.body is not None
             offsets = self.registered.of(frame.frame_id)
-            body = replace(body, offsets=offsets)
-        if self.pose_corrections is not None:
-            assert body is not None
-            body = self.pose_corrections(body, frame.frame_id)
-        frame = replace(frame, body=body)
+            frame = replace(frame, body=replace(frame.body, offsets=offsets))
 
         # A person who vanishes before the first epoch ends returns to here.
         if self.step == self.schedule.segmentation:
@@ -422,7 +413,6 @@ class AvatarTraining(LightningModule):
             self.avatar,
             self.feature_head,
             self.discriminator,
-            self.pose_corrections,
         )
         check_recipes(self.recipes, groups)
         self._names = list(groups)

@@ -22,8 +22,8 @@ class Recipe:
         rate: learning rate over the phases of the optimiser.
         betas, eps: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         clip: largest gradient norm; None leaves gradients alone.
-        span: of psi, colour and poses: the rate's shares are of ``both`` steps, or of ``step_one``,
-            after which the rate stays.
+        span: of psi and colour: the rate's shares are of ``both`` steps, or of ``step_one``, after
+            which the rate stays.
     """
 
     rate: Rate
@@ -56,7 +56,6 @@ def parameter_groups(
     avatar: Avatar,
     feature_head: nn.Module | None,
     discriminator: nn.Module | None,
-    pose_corrections: nn.Module | None,
 ) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
     # S learns alone, in the first phase.
@@ -77,10 +76,6 @@ def parameter_groups(
     if avatar.colour is not None:
         groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
 
-    # The poses of the training frames.
-    if pose_corrections is not None:
-        groups["poses"] = [(list(pose_corrections.parameters()), 1.0)]
-
     # The pose code learns with the generator, and the discriminator against them.
     if avatar.generator is not None and avatar.pose_encoder is not None:
         encoder = avatar.pose_encoder.parameters()
@@ -98,10 +93,10 @@ def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
         if name not in recipes:
             raise ConfigError(f"training.recipes lacks {name}")
 
-        # Only psi, colour and poses train in both steps.
+        # Only psi and colour train in both steps.
         if name not in SPLATTING and recipes[name].span != "both":
             raise ConfigError(
-                f"training.recipes.{name}.span is read for psi, colour and poses only"
+                f"training.recipes.{name}.span is read for psi and colour only"
             )
 
 

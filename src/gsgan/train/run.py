@@ -22,7 +22,6 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gsgan.body.turns import PoseCorrections
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
@@ -258,15 +257,9 @@ def build_training(
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
 
     # The training, with the settings that checkpoints store.
-    corrections = None
-    if avatar.effects.pose_corrections.on:
-        assert avatar.solver is not None
-        frames = data.splits.items["train"].frames
-        corrections = PoseCorrections(frames, avatar.solver.joint_names)
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
-            pose_corrections=corrections,
             record=training_record(record(config), data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )

@@ -19,7 +19,7 @@ STRETCHED_STEPS = (
     "coarse",
 )
 # optimisers of the parts that make Step I's image
-SPLATTING = ("psi", "colour", "poses")
+SPLATTING = ("psi", "colour")
 
 
 @dataclass(frozen=True)

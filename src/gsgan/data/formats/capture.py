@@ -3,7 +3,7 @@
 ::
 
     cameras.json      {camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}
-    meta.json         {unit, fps, up_axis, skeleton, pixel_centre, detected, body, label_names, ...}
+    meta.json         {unit, fps, up_axis, skeleton, pixel_centre, body, label_names, ...}
     images/{camera}/%06d.jpg|png        masks/{camera}/%06d.png   0..255
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
@@ -348,7 +348,6 @@ def _read_meta(
         skeleton=choose(
             path, content, "skeleton", "mediapipe33", tuple(SKELETONS)
         ),
-        detected=choose(path, content, "detected", False, (False, True)),
         body=body,
         label_names=None if names is None else tuple(map(str, names)),
         splits=splits,
