@@ -89,14 +89,6 @@ def test_constant_offsets_are_those_at_rest(body, placed):
     torch.testing.assert_close(found, torch.full_like(found, 0.02))
 
 
-def test_offsets_of_earlier_checkpoints_have_no_constant(placed):
-    state = placed.offsets.state_dict()
-    del state["rest"]
-    placed.offsets.rest.fill_(1)
-    placed.offsets.load_state_dict(state)
-    assert not placed.offsets.rest.any()
-
-
 @pytest.mark.parametrize("bound", [0.25, None])
 def test_residuals_with_an_offset_move_the_means_by_it(bound):
     psi = Deformation(

@@ -21,13 +21,6 @@ from gsgan.utils.tensors import derived, farthest_points
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
-POSE_BUFFERS = (
-    "pose_mean",
-    "pose_axes",
-    "pose_spread",
-    "place_mean",
-    "place_spread",
-)
 
 
 class Deformation(ResidualGaussians):
@@ -97,14 +90,13 @@ class Deformation(ResidualGaussians):
         self.position_octaves = position_octaves
         self.pose_limit = pose_limit
         size = 3 * joints
-        shapes = (
-            (size,),
-            (size, POSE_AXES),
-            (POSE_AXES,),
-            (points, 3),
-            (points, 3),
-        )
-        for name, shape in zip(POSE_BUFFERS, shapes, strict=True):
+        for name, shape in (
+            ("pose_mean", (size,)),
+            ("pose_axes", (size, POSE_AXES)),
+            ("pose_spread", (POSE_AXES,)),
+            ("place_mean", (points, 3)),
+            ("place_spread", (points, 3)),
+        ):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
 
@@ -209,13 +201,6 @@ class Deformation(ResidualGaussians):
         return torch.where(
             far.isfinite().all(), self.pose_mean + along @ axes.mT, code
         )
-
-    def _load_from_state_dict(
-        self, state: dict[str, Tensor], prefix: str, *rest: Any
-    ) -> None:
-        for name in POSE_BUFFERS:  # runs of before 2026-11-25 have none
-            state.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state, prefix, *rest)
 
     def residuals(
         self,
