@@ -39,28 +39,28 @@ class Fit:
     accuracy: Accuracy
 
     # Which poses are written, and which masks are used.
-    keep: bool = False
-    held_out: bool = False
-    min_mask: float = 0.1
+    keep: bool
+    held_out: bool
+    min_mask: float
 
     # The surface, and the numbers of steps, frames and cameras.
-    points: int = 3000
-    surface_steps: int = 150
-    sweeps: int = 15
-    frames: int = 60
-    cameras: int = 8
+    points: int
+    surface_steps: int
+    sweeps: int
+    frames: int
+    cameras: int
 
     # Weights of the priors, see `Fitter`.
-    noise: float = 0.02
-    landmarks: float = 0.02
-    prior: float = 0.005
-    loose: Sequence[int] = (*range(11), *range(17, 23))
+    noise: float
+    landmarks: float
+    prior: float
+    loose: Sequence[int]
 
     # Learning rates, and the share of the sweeps in which they stay.
-    angle_rate: float = 0.004
-    transl_rate: float = 0.0015
-    surface_rate: float = 0.01
-    hold: float = 0.4
+    angle_rate: float
+    transl_rate: float
+    surface_rate: float
+    hold: float
 
     def __post_init__(self) -> None:
         if self.accuracy is None:

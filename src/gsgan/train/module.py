@@ -99,17 +99,17 @@ class AvatarTraining(LightningModule):
         step_one: StepOneLoss,
         step_two: StepTwoLoss,
         *,
-        pose_noise: float = 0.01,
-        window: int | None = None,
-        window_reach: float = 0.2,
-        seed: int = 0,
-        max_skipped: int = 20,
-        skip_window: int = 1000,
-        log_every: int = 20,
-        average: float | None = None,
-        average_every: int = 1,
-        rollback: Rollback | None = None,
-        registration: Registration | None = None,
+        pose_noise: float,
+        window: int | None,
+        window_reach: float,
+        seed: int,
+        max_skipped: int,
+        skip_window: int,
+        log_every: int,
+        average: float | None,
+        average_every: int,
+        rollback: Rollback,
+        registration: Registration,
         pose_corrections: PoseCorrections | None = None,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
@@ -146,10 +146,10 @@ class AvatarTraining(LightningModule):
         # Logs, and what happens where training fails.
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
-        self.rollback = rollback or Rollback()
+        self.rollback = rollback
 
         # Where the surface of training frames is; known once it is registered.
-        self.registration = registration or Registration()
+        self.registration = registration
         self.registered: Registered | None = None
         self.pose_corrections = pose_corrections
 
