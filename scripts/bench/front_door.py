@@ -124,7 +124,7 @@ class Film:
         points = []
         for scene, frame in self.scenes:
             motion = scene.motion
-            vertices, _ = scene._skinned(frame)
+            vertices, _ = scene._skin(frame)
             points.append(
                 scene.character.landmarks(vertices, motion.joints[frame])
             )

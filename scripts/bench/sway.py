@@ -64,7 +64,7 @@ def main() -> None:
     train, test = np.array(scene.train_frames), np.array(scene.test_frames)
     points, off = [], []
     for f in range(len(t)):
-        v, normals = scene._skinned(f)
+        v, normals = scene._skin(f)
         moved, _, _ = scene.secondary(
             float(t[f]), scene.motion.rotations[f], v, normals
         )

@@ -23,7 +23,7 @@ from gsgan.data.splits import spread_frames
 from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import ScoreOptions, make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.frames import MaskedFrames, rotated
+from gsgan.fit.frames import MaskedFrames, rotate_cameras
 from gsgan.fit.run import fit_before_training, refuse_other_fit, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import moves_with_body
@@ -482,9 +482,9 @@ def test_frames_with_poses_far_from_each_other_are_used(people):
 
 def test_cameras_rotate():
     cameras = ["a", "b", "c", "d"]
-    assert rotated(cameras, None, 1) == cameras
-    assert rotated(cameras, 4, 1) == cameras
-    used = [rotated(cameras, 2, turn) for turn in range(4)]
+    assert rotate_cameras(cameras, None, 1) == cameras
+    assert rotate_cameras(cameras, 4, 1) == cameras
+    used = [rotate_cameras(cameras, 2, turn) for turn in range(4)]
     assert all(len(set(pair)) == 2 for pair in used)
     assert {camera for pair in used for camera in pair} == set(cameras)
 

@@ -8,7 +8,7 @@ import torch
 from gsgan.body import open_body
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import Deformation
-from gsgan.model.harmonic import distilled
+from gsgan.model.harmonic import distil
 from gsgan.scene import BodyPose
 from gsgan.train.run import build_training
 from gsgan.utils.tensors import matvec
@@ -118,7 +118,7 @@ def test_a_page_gets_the_offsets_as_residuals(tiny):
     frame = data.dataset("train")[0]
     body = avatar.body_pose(frame.skeleton, frame.visibility)
     pose = (frame.skeleton, frame.visibility, body)
-    found = distilled(avatar, [pose], ridge=1e-12, keep_offsets=False)
+    found = distil(avatar, [pose], ridge=1e-12, keep_offsets=False)
     assert found.body_points.offsets is None
     assert avatar.body_points.offsets is not None
     eye = frame.camera.centre

@@ -23,7 +23,7 @@ from gsgan.bench.common import (
     sentence,
 )
 from gsgan.data.datamodule import GsganData
-from gsgan.model.avatar import Avatar, unwatched
+from gsgan.model.avatar import Avatar, watch_nothing
 from gsgan.run.assemble import build_avatar, build_data
 from gsgan.run.runs import load_avatar
 from gsgan.run.stored import DataPaths, load_config
@@ -310,7 +310,7 @@ def measure(
         try:
             staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
-            avatar.stage = unwatched
+            avatar.stage = watch_nothing
 
         # The time outside all stages.
         rest = staged - sum(clock.frame.values())

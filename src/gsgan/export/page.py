@@ -113,7 +113,7 @@ def block(
 
     Args:
         run: the avatar's.
-        avatar: its `distilled` copy.
+        avatar: its copy by `distil`.
         motions: drives and their frames per second by name.
         name: the avatar's.
     """

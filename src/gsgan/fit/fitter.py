@@ -125,7 +125,7 @@ class FittedSurface(nn.Module):
         self.offsets = nn.Parameter(torch.zeros(basis.shape[1]))
         self.log_scale = nn.Parameter(torch.zeros(()))
 
-    def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
+    def pose(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
         # points at rest, moved along their normals by at most `MAX_CLOTHES`, then with the bones
         bones = self.body.transforms(pose)
@@ -280,7 +280,7 @@ class Fitter:
         for i in range(len(poses.theta)):
             # The surface in this frame's pose.
             pose = BodyPose(poses.theta[i][None], poses.transl[i][None])
-            person, _ = self.surface.posed(pose)
+            person, _ = self.surface.pose(pose)
 
             # Unsure pixels do not count.
             ious = []
@@ -298,7 +298,7 @@ class Fitter:
 
     def _share(self, i: int, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
-        person, landmarks = self.surface.posed(pose)
+        person, landmarks = self.surface.pose(pose)
         wrong = []
         areas = []
 

@@ -262,7 +262,7 @@ def fit_body(
     refuse_swapped_sides(layout, data.trained)
 
     # the frames with a person in their masks
-    frames = _masked_frames(data, settings, device, console)
+    frames = _read_masks(data, settings, device, console)
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     # the shape and the poses by the skeletons
@@ -273,10 +273,10 @@ def fit_body(
 
     # the poses by the masks, and with them the places of the landmarks
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
-    found = _registered(fitter, settings, console)
+    found = _register(fitter, settings, console)
     with torch.no_grad():
         registered = found.to(torch.device("cpu"))
-        shape = _refined(data, shape, frames.frames, registered)
+        shape = _refine_shape(data, shape, frames.frames, registered)
 
     # all poses by the skeletons again
     poses = {False: _solve_all(data, shape, console)}
@@ -309,7 +309,7 @@ def _keeps(settings: Fit) -> bool:
     return settings.held_out or settings.keep
 
 
-def _masked_frames(
+def _read_masks(
     data: GsganData, settings: Fit, device: torch.device, console: Console
 ) -> MaskedFrames:
     """The frames that are registered, with the progress of reading their masks."""
@@ -330,7 +330,7 @@ def _masked_frames(
     return frames
 
 
-def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
+def _register(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
     """The poses after all steps of the fit."""
     # The surface comes first, in the solved poses; surface and poses follow together.
     with progress(console) as bars:
@@ -480,7 +480,7 @@ def _fingers(shape: BodyShape) -> list[int]:
     return [i for i, name in enumerate(names) if name.startswith("finger")]
 
 
-def _refined(
+def _refine_shape(
     data: GsganData,
     shape: BodyShape,
     frames: Sequence[int],

@@ -390,7 +390,7 @@ def _fit_landmarks(
             _, g, H, w = solver.normal(q, at, weight)
 
         # derivatives of the posed landmarks by the shape
-        posed = partial(_posed, space, solver, q, root)
+        posed = partial(_pose, space, solver, q, root)
         by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
         transforms = solver.transforms(q, root, solver.joints)
         by_offsets = transforms[:, solver.carrier, :3, :3] @ symmetric
@@ -415,7 +415,7 @@ def _fit_landmarks(
     return shape_of(space, x)
 
 
-def _posed(
+def _pose(
     space: ShapeSpace[B],
     solver: Solver,
     q: Tensor,

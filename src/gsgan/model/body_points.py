@@ -147,7 +147,7 @@ class LearntWeights(nn.Module):
         self._interpolate = Interpolation()
         self._interpolate_field = Interpolation()
 
-    def interpolated(self, values: Tensor) -> Tensor:
+    def interpolate(self, values: Tensor) -> Tensor:
         """``[N, C]`` values of the controls ``[A, C]`` at the points."""
         return self._interpolate(values, self.near, self.share)
 
@@ -285,7 +285,7 @@ class SkinnedGaussians(nn.Module):
         logit = math.log(opacity / (1 - opacity))
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
-    def deformed(
+    def deform(
         self,
         A: Tensor,
         means: Tensor,
@@ -478,7 +478,7 @@ class BodyPoints(nn.Module):
         bones = self.points.with_bones(pose).bones
         assert bones is not None
         terms = self.stretch_terms() if self.stretch else None
-        means, A, t, jacobian, normals = self._skinned(bones, terms)
+        means, A, t, jacobian, normals = self._skin(bones, terms)
         offset = self.offset(pose)
         if offset is not None:
             means = means + matvec(A, offset)
@@ -502,18 +502,18 @@ class BodyPoints(nn.Module):
         if self.offsets is None or learnt is None:
             return None
         found: Tensor = self.offsets(
-            pose.theta, learnt.interpolated, pose.offsets
+            pose.theta, learnt.interpolate, pose.offsets
         )
         return found
 
-    def _skinned(
+    def _skin(
         self, bones: Tensor, terms: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
         """Means, frames, origins, Jacobians and normals; in compiled code if it can be used."""
         weights = self.points.weights
         rest = self.points.means
         if compiled.has_skinned(bones, weights[1]):
-            return compiled.skinned(
+            return compiled.skin_points(
                 bones,
                 rest,
                 self.rest_normals,
@@ -534,7 +534,7 @@ class BodyPoints(nn.Module):
         jacobian = None
         if terms is not None:
             jacobian = stretched(A, bones, rest, *terms, self.stretch_limit)
-        normals = moved_normals(
+        normals = move_normals(
             A if jacobian is None else jacobian, self.rest_normals
         )
         return means, A, t, jacobian, normals
@@ -572,7 +572,7 @@ def points_per_pixel(count: int, stature: float, scale: float) -> float:
     return 4 * count / (area * scale**2)
 
 
-def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
+def move_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 
     Normals are transformed by the cofactors of A, det(A) A⁻ᵀ without the division. Where skinning

@@ -1,6 +1,6 @@
 """Points on a skinned body, and the geometry of Ĝ, in compiled code, on CPUs.
 
-`gsgan.model.body_points.BodyPoints` calls `skinned`, `gsgan.model.deformation.Deformation` calls
+`gsgan.model.body_points.BodyPoints` calls `skin_points`, `gsgan.model.deformation.Deformation` calls
 `geometry`; both define the same by tensor operations.
 """
 
@@ -46,7 +46,7 @@ _SkinJob = build.job_type(
 
 
 def has_skinned(bones: Tensor, weight: Tensor) -> bool:
-    """Whether `skinned` can be used: on a CPU, where no transform of a bone needs a gradient."""
+    """Whether `skin_points` can be used: on a CPU, where no transform of a bone needs a gradient."""
     return (
         bones.device.type == "cpu"
         and bones.dtype in build.DTYPES
@@ -56,7 +56,7 @@ def has_skinned(bones: Tensor, weight: Tensor) -> bool:
     )
 
 
-def skinned(
+def skin_points(
     bones: Tensor,
     rest: Tensor,
     normals: Tensor,

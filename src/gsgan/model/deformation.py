@@ -105,12 +105,12 @@ class Deformation(ResidualGaussians):
             "rest_code", positional_encoding(rest_points.float(), rest_octaves)
         )
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
-        point_size = encoded_size(3, rest_octaves) + embedding
+        point_size = encoding_size(3, rest_octaves) + embedding
 
         # The first layer has a part for each input, so that those of points are computed once.
         self.from_point = nn.Linear(point_size, width)
         self.from_position = nn.Linear(
-            encoded_size(3, position_octaves), width, bias=False
+            encoding_size(3, position_octaves), width, bias=False
         )
         self.from_pose = nn.Linear(3 * joints, width, bias=False)
         self.from_normal = nn.Linear(3, width, bias=False) if normals else None
@@ -224,7 +224,7 @@ class Deformation(ResidualGaussians):
             raw += (
                 table if chosen is None else functional.embedding(chosen, table)
             )
-        residuals = self._parted(raw)
+        residuals = self._split(raw)
 
         # Colours are lit by where the points face in this pose, and by what shades them, which is
         # found where the MLP is computed.
@@ -241,10 +241,10 @@ class Deformation(ResidualGaussians):
         """Values where the MLP is computed ``[B, A, C]`` at the points ``chosen [B, M]``, or at
         all."""
         if self.anchored:
-            return self._interpolated(values, chosen)
+            return self._interpolate(values, chosen)
         return values if chosen is None else rows_of(values, chosen)
 
-    def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
+    def _interpolate(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
         items = []
         for i, values in enumerate(raw):
@@ -284,7 +284,7 @@ class Deformation(ResidualGaussians):
         if torch.is_grad_enabled() and not (
             code.requires_grad or normals.requires_grad
         ):
-            x = self._trained(code, normals, pose)
+            x = self._run_trunk(code, normals, pose)
         else:
             # The inputs that depend on both pose and point enter by one product.
             weight = self.from_position.weight
@@ -326,7 +326,7 @@ class Deformation(ResidualGaussians):
             self.rest_code,
         )
 
-    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
+    def _run_trunk(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
         """The trunk's output; its layers are one operation, which computes no unused gradient."""
         # Inputs that need no gradient come first, those that learn last.
         given = [self.rest_code, code]
@@ -377,7 +377,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
 
 
-def encoded_size(dimensions: int, octaves: int) -> int:
+def encoding_size(dimensions: int, octaves: int) -> int:
     """Size of the `positional_encoding` of ``dimensions`` coordinates."""
     return dimensions * (1 + 2 * octaves)
 

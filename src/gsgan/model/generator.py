@@ -146,7 +146,7 @@ class DecoderLevel(nn.Module):
         # The kernel has a part for the upsampled map, and one for the skip.
         C = h.shape[1]
         kernel = derived(
-            self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight
+            self, "upper", lambda: upsampling_kernel(weight[:, :C]), weight
         )
         lower = derived(
             self, "lower", lambda: channels_last(weight[:, C:]), weight
@@ -304,7 +304,7 @@ class Generator(nn.Module):
             )
 
         # E_c and E_s give features at every level.
-        features = self._padded(F)
+        features = self._pad(F)
         others = [x for x in (S, p2d) if x is not None]
         skips = self.content.levels(self._stem(features, others, fine))
         styles = self.style(features)
@@ -359,7 +359,7 @@ class Generator(nn.Module):
             kernel = derived(
                 self, "fine", lambda: fine_kernel(weight, C, k), weight
             )
-            fine = self._padded(fine, k)
+            fine = self._pad(fine, k)
             h = functional.conv2d(fine, kernel, bias, k * stride, k * padding)
 
         # The parts for S and p₂D.
@@ -370,12 +370,12 @@ class Generator(nn.Module):
                 self, f"part {i}", partial(channels_last, part), weight
             )
             h += functional.conv2d(
-                self._padded(given), kernel, None, stride, padding
+                self._pad(given), kernel, None, stride, padding
             )
             first += given.shape[1]
         return h
 
-    def _padded(self, x: Tensor, times: int = 1) -> Tensor:
+    def _pad(self, x: Tensor, times: int = 1) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""
         (height, width), stride = x.shape[-2:], times * self.stride
         if height % stride or width % stride:
@@ -398,7 +398,7 @@ def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
     return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))
 
 
-def upsampled_kernel(weight: Tensor) -> Tensor:
+def upsampling_kernel(weight: Tensor) -> Tensor:
     """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
     ``[O, I, 3, 3]`` after upsampling to the nearest."""
     for dim in (2, 3):

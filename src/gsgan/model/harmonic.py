@@ -162,11 +162,11 @@ class Harmonic(ResidualGaussians):
             raw = raw.gather(
                 1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
             )
-        return self._parted(raw)
+        return self._split(raw)
 
 
 @torch.no_grad()
-def distilled(
+def distil(
     avatar: Avatar,
     poses: Iterable[Pose],
     *,
@@ -279,7 +279,7 @@ def ridge_regression(
 
     Args:
         samples: pairs ``[N, K]``, ``[N, C]``; the first input is 1.
-        ridge: see `distilled`; the first input has no penalty.
+        ridge: see `distil`; the first input has no penalty.
 
     Returns:
         ``[N, K, C]`` and ``[N, C]``, float64.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import distilled
+from gsgan.model.harmonic import distil
 from gsgan.motion.clip import (
     FPS,
     Clip,
@@ -490,11 +490,11 @@ def inputs_of(
 
 def distilled_of(options: MotionOptions, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
-    `gsgan.model.harmonic.distilled`. The offsets of pose are part of them."""
+    `gsgan.model.harmonic.distil`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.
     drive = drive_of(replace(options, motion="train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
-    return distilled(
+    return distil(
         run.avatar,
         (inputs_of(run.avatar, drive, i) for i in chosen),
         keep_offsets=False,

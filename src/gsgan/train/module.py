@@ -45,10 +45,10 @@ T = TypeVar("T")
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
-def fitted_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
-    """The schedule with the phases that an avatar has, see `Schedule.fitted`."""
+def fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
+    """The schedule with the phases that an avatar has, see `Schedule.fit_parts`."""
     S = avatar.segmentation
-    return schedule.fitted(
+    return schedule.fit_parts(
         segmentation=S is not None and S.labelled,
         splats=avatar.splats is not None,
         generator=avatar.generator is not None,
@@ -71,7 +71,7 @@ class AvatarTraining(LightningModule):
         avatar: to be trained.
         discriminator: None, or no adversarial weight, leaves the GAN out.
         perceptual: builds L_perc, where the schedule and the weights have it; None leaves it out.
-        schedule: iterations of each phase, see `Schedule.fitted`.
+        schedule: iterations of each phase, see `Schedule.fit_parts`.
         recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
@@ -120,7 +120,7 @@ class AvatarTraining(LightningModule):
         # Several optimisers take turns, so the module steps them itself.
         self.automatic_optimization = False
         self.avatar = avatar
-        self.schedule = fitted_schedule(schedule, avatar)
+        self.schedule = fit_schedule(schedule, avatar)
         self.recipes = recipes
 
         # The losses, with the networks that they need.
@@ -272,14 +272,14 @@ class AvatarTraining(LightningModule):
 
     def _train_segmentation(self, frame: Frame) -> None:
         assert self.avatar.segmentation is not None
-        loss = self._computed(partial(self.avatar.segmentation.loss, frame))
+        loss = self._compute_all(partial(self.avatar.segmentation.loss, frame))
         if loss is not None:
             self._descend({"segmentation/nll": loss}, "segmentation")
 
     def _train_step_one(self, frame: Frame) -> None:
         # Only Step I's colour is rendered; no image is generated.
-        rendering = self._computed(
-            partial(self._rendered, frame, generate=False)
+        rendering = self._compute_all(
+            partial(self._render, frame, generate=False)
         )
         if rendering is None:
             return
@@ -308,8 +308,8 @@ class AvatarTraining(LightningModule):
 
     def _train_step_two(self, frame: Frame) -> None:
         # I_pred is rendered, and judged by the discriminator while the GAN trains.
-        rendering = self._computed(
-            partial(self._rendered, frame, generate=True)
+        rendering = self._compute_all(
+            partial(self._render, frame, generate=True)
         )
         if rendering is None:
             return
@@ -335,7 +335,7 @@ class AvatarTraining(LightningModule):
                 {"step_two/discriminator": maps.loss()}, "discriminator"
             )
 
-    def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
+    def _render(self, frame: Frame, *, generate: bool) -> Rendering:
         # The training's own settings: noise on the pose, and less work where the schedule allows
         # it.
         rendering: Rendering = self.avatar(
@@ -413,7 +413,7 @@ class AvatarTraining(LightningModule):
         """The optimisers of the parts that make Step I's image."""
         return [name for name in SPLATTING if name in self._names]
 
-    def _computed(self, compute: Callable[[], T]) -> T | None:
+    def _compute_all(self, compute: Callable[[], T]) -> T | None:
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
         # A failure is kept until all processes know of it.
@@ -447,7 +447,7 @@ class AvatarTraining(LightningModule):
 
         # The run stops if too many were skipped, else it goes on.
         if stop:
-            raise self._stopped(
+            raise self._stop_error(
                 f"{count} were skipped: {cause}; lower training.recipes.*.rate.peak, or go on with "
                 "a larger training.max_skipped"
             )
@@ -455,7 +455,7 @@ class AvatarTraining(LightningModule):
             f"iteration {self.step}: skipped ({count}, at most {self.skipped.maximum}): {cause}"
         )
 
-    def _stopped(self, why: str) -> GsganError:
+    def _stop_error(self, why: str) -> GsganError:
         """The error that ends a run."""
         return GsganError(
             f"training stopped at iteration {self.step}: {why} (the last good checkpoint is kept)"
@@ -521,7 +521,7 @@ class AvatarTraining(LightningModule):
             wrapped.optimizer for wrapped in self._optimisers().values()
         ]
         if not self.rollback.restore(self, optimisers):
-            raise self._stopped(
+            raise self._stop_error(
                 f"{what}, also after {self.rollback.done} returns to a good state; start again "
                 "with a lower training.recipes.psi.rate.peak"
             )

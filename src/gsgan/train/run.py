@@ -33,7 +33,7 @@ from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.metrics.lpips import build_lpips
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.harmonic import Harmonic, distil
 from gsgan.motion.clip import FPS
 from gsgan.run.assemble import (
     build_avatar,
@@ -315,9 +315,7 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
     frames = data.dataset("train")
     once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()
     poses = (frames[i].inputs for i in once)
-    fitted = distilled(
-        trained, ((p, seen, body) for p, seen, _, body, _ in poses)
-    )
+    fitted = distil(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
 
     # Other points at rest would need other residuals, so both avatars must have the same.
     state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
