@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gsgan.body import Body
 from gsgan.body.lbs import axis_angle_to_matrix
-from gsgan.body.shape import shaped_body
+from gsgan.body.shape import shape_body
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_hands, fit_shape
 from gsgan.motion.character import Animation, Character
@@ -162,9 +162,9 @@ def errors(
     seen = torch.ones(len(marks), JOINTS)
     shape = fit_shape(marks[:, :33], seen[:, :33])
     shape = fit_hands(
-        shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen
+        shape, Solver(shape_body(shape)).solve(marks, seen), marks, seen
     )
-    body = shaped_body(shape)
+    body = shape_body(shape)
     solver = Solver(body)
     pose = {
         name: solver.solve(p, torch.ones(p.shape[:2]))

@@ -13,7 +13,7 @@ import trimesh
 from commands import refused
 
 from gsgan.body import free_body
-from gsgan.body.shape import free_space, shaped_body
+from gsgan.body.shape import free_space, shape_body
 from gsgan.body.skinned import carry
 from gsgan.body.smpl import read_smpl
 from gsgan.export.glb import to_y_up
@@ -37,7 +37,7 @@ def person():
     """The free body in a shape of its own."""
     shape = free_space().neutral()
     shape.stretch[:2] = 1.2
-    return shaped_body(replace(shape, offsets=0.02 * torch.ones(33, 3)))
+    return shape_body(replace(shape, offsets=0.02 * torch.ones(33, 3)))
 
 
 def joints_of(motion: BodyMotion) -> np.ndarray:

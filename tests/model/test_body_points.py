@@ -11,7 +11,7 @@ from tiny_characters import TINY
 from torch.nn import functional
 
 from gsgan.body import open_body
-from gsgan.body.lbs import stretched
+from gsgan.body.lbs import stretch_jacobian
 from gsgan.body.skinned import neighbours_on_surface, vertex_normals
 from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
@@ -351,7 +351,9 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
         own = placed.gradients(
             placed.points.bone_index, placed.points.bone_weight
         )
-        wrong = stretched(points.frames, bones, placed.points.means, *own)
+        wrong = stretch_jacobian(
+            points.frames, bones, placed.points.means, *own
+        )
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)
     moved = points.means[0, b] - points.means[0, a]

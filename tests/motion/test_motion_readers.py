@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils._pytree import tree_map
 
-from gsgan.body.shape import free_space, shaped_body
+from gsgan.body.shape import free_space, shape_body
 from gsgan.body.smpl import read_smpl
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
@@ -122,7 +122,7 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
     (tmp_path / "meta.json").write_text('{"unit": "cm", "fps": 50}')
     path = tmp_path / "body_pose.npz"
     np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
-    posed = shaped_body(shape).posed_landmarks(dance).double()
+    posed = shape_body(shape).posed_landmarks(dance).double()
     own = measure_proportions(
         posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z"
     )

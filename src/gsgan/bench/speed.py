@@ -149,7 +149,7 @@ def load_subject(
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar = build_avatar(config, data.info, data.labelled("train"))
+        avatar = build_avatar(config, data.info, data.select_labelled("train"))
         name = "untrained avatar"
         marks = [
             "untrained weights: the time of F depends on the places of its Gaussians"

@@ -208,7 +208,7 @@ class Solver(nn.Module):
 
         # Gradients need the steps in torch.
         if not self._live(skeleton) and compiled.available(skeleton):
-            return self._compiled(skeleton, visibility)
+            return self._solve_compiled(skeleton, visibility)
 
         # The 33 landmarks, about the middle of the hips.
         skeleton = skeleton.to(self.joints.device)
@@ -266,7 +266,7 @@ class Solver(nn.Module):
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
-    def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
+    def _solve_compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """`solve` by compiled code."""
         # The compiled solver runs on the CPU, in the dtype of the skeleton.
         p = skeleton.cpu()
@@ -348,7 +348,7 @@ class Solver(nn.Module):
                 buffers["rounds"] = torch.tensor(FINGER_ROUNDS)
                 for name in compiled.FINGERS:
                     own[f"finger_{name}"] = buffers[name]
-            return compiled.held(own)
+            return compiled.to_constants(own)
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
@@ -380,7 +380,7 @@ class Solver(nn.Module):
         # A placed hand counts by its palm.
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
-            placed = fingers.placed(hands)
+            placed = fingers.has_palms(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
             seen = torch.cat(
                 [seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1
@@ -401,7 +401,7 @@ class Solver(nn.Module):
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
-            moved[:, fingers.joints] += fingers.shown(hands)
+            moved[:, fingers.joints] += fingers.has_landmarks(hands)
         return moved == 0
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -595,7 +595,7 @@ class Solver(nn.Module):
             # different units.
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
             scaled = best.matrix + torch.diag_embed(damping * diagonal)
-            q = best_q + _solved(scaled, -best.gradient)
+            q = best_q + _solve_spd(scaled, -best.gradient)
 
             # The root's turn goes into its rotation: the next step starts from no turn.
             root = axis_angle_to_matrix(q[:, :3]) @ best_root
@@ -615,9 +615,9 @@ class Solver(nn.Module):
             )
 
             # A worse step is undone, with its equations.
-            best_q = _chosen(better, q, best_q)
-            best_root = _chosen(better, root, best_root)
-            best = NormalEquations(*map(partial(_chosen, better), new, best))
+            best_q = _select(better, q, best_q)
+            best_root = _select(better, root, best_root)
+            best = NormalEquations(*map(partial(_select, better), new, best))
             if bool(done.all()):
                 break
         return best_q, best_root
@@ -635,11 +635,11 @@ class Solver(nn.Module):
             H = self.normal(q, self.linear(q, root, p), weight).matrix
         for _ in range(GRADIENT_STEPS if self._live(p) else 1):
             at = self.normal(q, self.linear(q, root, p), weight)
-            q = q - _solved(H, at.gradient)
+            q = q - _solve_spd(H, at.gradient)
         return q
 
 
-def _chosen(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
+def _select(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """``a`` of the frames ``[B]`` bool, ``b`` of the others."""
     return torch.where(frames.view(-1, *[1] * (a.ndim - 1)), a, b)
 
@@ -695,7 +695,7 @@ def _jumps(parent: Tensor) -> Tensor:
     return torch.stack(found)
 
 
-def _solved(H: Tensor, g: Tensor) -> Tensor:
+def _solve_spd(H: Tensor, g: Tensor) -> Tensor:
     """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
     # Without a check, which would wait for the device.
     factor, _ = torch.linalg.cholesky_ex(H)

@@ -13,7 +13,7 @@ from gsgan.utils.arrays import Ints
 B = TypeVar("B", bound=SkinnedBody)
 
 
-def subdivided(body: B, count: int) -> B:
+def subdivide(body: B, count: int) -> B:
     """The body with ``count`` vertices, whose first ones are its own.
 
     The longest edges get a vertex in their middle, so that vertices spread more evenly. It has the
@@ -21,11 +21,11 @@ def subdivided(body: B, count: int) -> B:
     no more than the body's vertices changes nothing.
     """
     while len(body.vertices) < count:
-        body = _halved(body, count - len(body.vertices))
+        body = _halve(body, count - len(body.vertices))
     return body
 
 
-def _halved(body: B, maximum: int) -> B:
+def _halve(body: B, maximum: int) -> B:
     """The body with at most so many edges halved, the longest first."""
     # Every edge once, and the edges ab, bc and ca of each face.
     faces = body.faces.numpy()

@@ -136,7 +136,7 @@ def _hands_and_face(
         found.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
         found.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
     if face is not None and frame in face.p:
-        found.append((face.seen(frame), MIDDLE_COLOUR))
+        found.append((face.visible_joints(frame), MIDDLE_COLOUR))
     return found
 
 

@@ -423,7 +423,7 @@ def _toml_camera(
     # A rotation that is no matrix is a Rodrigues vector.
     R = entry["rotation"]
     if as_floats(R).shape != (3, 3):
-        R = _turned_by(where, R, "rotation")
+        R = _rotation_matrix(where, R, "rotation")
     return make_camera(
         where,
         name,
@@ -572,11 +572,11 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     # Files have the matrix, the vector, or both.
     R = extri.get(f"Rot_{name}")
     if R is None and f"R_{name}" in extri:
-        R = _turned_by(where, extri[f"R_{name}"], f"R_{name}")
+        R = _rotation_matrix(where, extri[f"R_{name}"], f"R_{name}")
     return R
 
 
-def _turned_by(where: str, value: Any, what: str) -> Any:
+def _rotation_matrix(where: str, value: Any, what: str) -> Any:
     """The matrix ``[3, 3]`` of a Rodrigues vector, whose length is an angle in radians."""
     vector = numbers(where, value, what, (3,))
     angle = float(np.linalg.norm(vector))

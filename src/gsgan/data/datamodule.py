@@ -428,7 +428,7 @@ class GsganData(LightningDataModule):
         self.setup()
         return self._datasets[split]
 
-    def labelled(self, split: str) -> Subset[Frame]:
+    def select_labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
         dataset = self.dataset(split)
 

@@ -168,7 +168,7 @@ class CaptureDataset(Dataset[Frame]):
         # Resampled as `_load` does.
         item = self.items[index]
         fit = self._fitting(item)
-        mask, unsure = self._stored_mask(item)
+        mask, unsure = self._read_mask(item)
         mask = fit(mask, self.layout.pixels.mask_sampling == "nearest")
         if unsure is not None:
             unsure = fit(unsure, True)
@@ -211,7 +211,7 @@ class CaptureDataset(Dataset[Frame]):
         """The camera of the item's image: window and scale are in its K."""
         window = self.window(item)
         size = None if self.size is None else (self.size, self.size)
-        return self._entry(item).seen(window, size, lens=self.lens == "raw")
+        return self._entry(item).view_of(window, size, lens=self.lens == "raw")
 
     def _raw(self, camera: CameraEntry) -> bool:
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
@@ -234,7 +234,7 @@ class CaptureDataset(Dataset[Frame]):
         fit = self._fitting(item)
 
         # Mask and image as stored.
-        mask, unsure = self._stored_mask(item)
+        mask, unsure = self._read_mask(item)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
 
@@ -261,7 +261,7 @@ class CaptureDataset(Dataset[Frame]):
         chw = np.ascontiguousarray(image.transpose(2, 0, 1))
         return DecodedImage(chw, mask, labels, unsure)
 
-    def _stored_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
+    def _read_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
         """The mask of an item and its unsure pixels, as stored."""
         # Several files may make one mask; its size is checked once they are joined.
         rules = self.layout.pixels

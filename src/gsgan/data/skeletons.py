@@ -46,7 +46,7 @@ class Landmarks:
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
 
-    def seen(self, frame: int) -> Float:
+    def visible_joints(self, frame: int) -> Float:
         """``[N, 3]`` the visible joints of a frame."""
         return self.p[frame][self.visibility[frame] > 0]
 

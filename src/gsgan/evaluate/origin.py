@@ -43,7 +43,7 @@ class Method:
     trained_by: list[str] | None = None
 
 
-def trained(folder: Path, **training: Any) -> Method:
+def read_method(folder: Path, **training: Any) -> Method:
     """The method of a run folder, with the fields of ``training``."""
     # The names in the run's config.
     chosen = choices(folder)

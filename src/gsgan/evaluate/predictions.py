@@ -279,7 +279,7 @@ def read_folder(
     # All files by their names without leading zeros of numbers.
     stored: dict[str, list[str]] = {}
     for name in sorted(glob("**", root_dir=root, recursive=True)):
-        stored.setdefault(_unpadded(name), []).append(name)
+        stored.setdefault(_strip_zeros(name), []).append(name)
 
     # Every expected image, once. All missing ones are counted before they are reported.
     files = {}
@@ -297,8 +297,8 @@ def read_folder(
 
             # Numbers are compared without their zeros: programs pad them
             # differently.
-            name = _filled(pattern, values)
-            found = stored.get(_unpadded(name), [])
+            name = _fill_fields(pattern, values)
+            found = stored.get(_strip_zeros(name), [])
             if not found:
                 missing.append(f"{what}, expected as {name}")
                 continue
@@ -321,12 +321,12 @@ def read_folder(
     return PredictionFolder(root, files, background)
 
 
-def _filled(pattern: str, values: Mapping[str, str]) -> str:
+def _fill_fields(pattern: str, values: Mapping[str, str]) -> str:
     """The pattern with every field replaced by its value."""
     return FIELD.sub(lambda field: values[field[1]], pattern)
 
 
-def _unpadded(name: str) -> str:
+def _strip_zeros(name: str) -> str:
     """The name with every number stripped of leading zeros."""
     # A number of zeros keeps one.
     return re.sub("[0-9]+", lambda digits: digits[0].lstrip("0") or "0", name)

@@ -36,7 +36,7 @@ from gsgan.evaluate.files import (
 )
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
-from gsgan.evaluate.origin import Method, fingerprint, origin, trained
+from gsgan.evaluate.origin import Method, fingerprint, origin, read_method
 from gsgan.evaluate.predictions import BodyBoxes, Preparation, read_folder
 from gsgan.evaluate.scores import (
     Predict,
@@ -332,7 +332,7 @@ def evaluate_folder(
         out = out / f"of_{options.score_images}_images"
 
     # What facts.json states about the run.
-    method = trained(
+    method = read_method(
         folder,
         seed=stored.seed,
         iterations=state["step"],
@@ -550,7 +550,7 @@ def evaluate_method(
     for split, found in scores.items():
         if found.grid:
             write_grid(found.grid, folder / "grids" / f"{split}.png")
-    joined = _joined_splits(scores, scorer, data, origin(method, data, device))
+    joined = _join_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
     if poses is not None and not joined.rows.empty:
         write_distances(folder, joined.rows, data, poses, console, beside)
@@ -618,7 +618,7 @@ def _score(
     )
 
 
-def _joined_splits(
+def _join_splits(
     scores: dict[str, SplitScores],
     scorer: Scorer,
     data: GsganData,

@@ -39,7 +39,7 @@ from gsgan.run.drive import (
     REST,
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
     inputs_of,
 )
@@ -273,7 +273,7 @@ def _block(
         drive = _poses(replace(options, motion=motion), config, run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
-    return block(run, distilled_of(options, run), motions, name)
+    return block(run, distil_run(options, run), motions, name)
 
 
 def _poses(options: MotionOptions, config: DictConfig, run: Run) -> Drive:

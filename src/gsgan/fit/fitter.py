@@ -209,7 +209,7 @@ class Fitter:
         self.pose_optimiser = torch.optim.SparseAdam(
             self.moves.parameters(), settings.angle_rate, BETAS
         )
-        self.shaped = 0
+        self.body_of = 0
         self.swept = 0
 
     def pose(self, rows: Tensor | None = None) -> BodyPose:
@@ -226,7 +226,7 @@ class Fitter:
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""
         # The frame follows from the seed and the step.
-        chance = random.Random(f"{self.seed} surface {self.shaped}")
+        chance = random.Random(f"{self.seed} surface {self.body_of}")
         i = chance.randrange(len(self.start.theta))
         with torch.no_grad():
             pose = self.pose(torch.tensor([i]))
@@ -236,7 +236,7 @@ class Fitter:
         self.surface_optimiser.zero_grad()
         share.backward()  # type: ignore[no-untyped-call]
         self.surface_optimiser.step()
-        self.shaped += 1
+        self.body_of += 1
 
     def sweep(self) -> None:
         """One step on every frame, in random order."""

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsgan.body import Body
 from gsgan.body.fingers import Fingers
-from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.shape import BodyShape, shape_body
 from gsgan.body.solve import ON_HANDS, Solver
 from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
@@ -272,7 +272,7 @@ def fit_body(
         start = _solve_with_fingers(data, shape, frames.frames)
 
     # the poses by the masks, and with them the places of the landmarks
-    fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
+    fitter = Fitter(settings, frames, shape_body(shape), start, seed)
     found = _register(fitter, settings, console)
     with torch.no_grad():
         registered = found.to(torch.device("cpu"))
@@ -283,7 +283,7 @@ def fit_body(
     if layout.hands is not None:
         poses[True] = _solve_all(data, shape, console, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
-    report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
+    report = fit_report(fitter, shape_body(shape).to(device), driven, found)
     report["settings"] = asdict(settings)
 
     # the files, and what they say
@@ -432,7 +432,7 @@ def _solve(
     try:
         with torch.no_grad():
             joints, visibility = _joints(data, frames, hands)
-            return Solver(shaped_body(shape)).solve(joints, visibility)
+            return Solver(shape_body(shape)).solve(joints, visibility)
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
         raise DataError(
@@ -476,7 +476,7 @@ def _by_hands(data: GsganData) -> bool:
 
 
 def _fingers(shape: BodyShape) -> list[int]:
-    names = shaped_body(shape).joint_names
+    names = shape_body(shape).joint_names
     return [i for i, name in enumerate(names) if name.startswith("finger")]
 
 
@@ -504,7 +504,7 @@ def _refine_shape(
 
     # the offsets of those of the 33 landmarks that are on placed hands
     body = len(MEDIAPIPE33.names)
-    placed = Fingers.placed(seen[:, body:] > 0)
+    placed = Fingers.has_palms(seen[:, body:] > 0)
     used = torch.zeros(len(p), body)
     for side, rows in enumerate(ON_HANDS):
         used[:, rows] = seen[:, rows] * placed[:, [side]]

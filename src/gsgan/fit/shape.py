@@ -17,7 +17,7 @@ from gsgan.body.shape import (
     BodyShape,
     ShapeSpace,
     free_space,
-    shaped_body,
+    shape_body,
 )
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
@@ -120,7 +120,7 @@ def fit_hands(
         return shape
 
     # The size is the ratio of the person's lengths to the body's.
-    own = shaped_body(shape).hand_landmarks
+    own = shape_body(shape).hand_landmarks
     own_length = (own[last] - own[first]).norm(dim=-1)
     size = length[known].sum() / own_length[known].sum()
     stretch = shape.stretch.clone()
@@ -128,7 +128,7 @@ def fit_hands(
     shape = replace(shape, stretch=stretch)
 
     # the hands in each frame, by landmarks other than the wrists
-    body = shaped_body(shape)
+    body = shape_body(shape)
     wrists = [WRIST, HAND + WRIST]
     fingers = Fingers(body)
     beyond = seen.clone()
@@ -144,7 +144,7 @@ def fit_hands(
     in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
 
     # The medians over frames that show the hand with its forearm.
-    usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
+    usable = fingers.has_palms(seen) & (visibility[:, FOREARMS] > 0).all(-1)
     on_arm = _median(on_arm, usable.unsqueeze(-1))
     in_hand = _median(in_hand, usable.unsqueeze(-1))
 
@@ -174,7 +174,7 @@ def fit_offsets(
         visibility: ``[F, 33]``; landmarks at 0 are not used.
     """
     # The landmarks in the person's skeletons, moved back to the rest pose.
-    body = shaped_body(shape)
+    body = shape_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
     moved = (
         _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons)
@@ -320,7 +320,7 @@ def _fit_lengths(
 
     # The logarithm of each distance against the target's, in standard deviations.
     def residual(x: Tensor) -> Tensor:
-        q = space.shaped(shape_of(space, x)).landmarks
+        q = space.body_of(shape_of(space, x)).landmarks
         return ((q[a] - q[b]).norm(dim=-1).log() - target) / sigma
 
     prior = shape_prior(space)
@@ -379,7 +379,7 @@ def _fit_landmarks(
     for _ in range(STEPS):
         # the poses of the current shape, and their normal equations
         with torch.no_grad():
-            solver = Solver(space.shaped(shape_of(space, x)))
+            solver = Solver(space.body_of(shape_of(space, x)))
             weight = solver.weights(seen)
             q, root = solver.guess(p) if held is None else held
             q, root = solver.descend(
@@ -425,7 +425,7 @@ def _pose(
 ) -> Tensor:
     """The landmarks ``[F, 33, 3]`` of a shape in poses."""
     # The body of this shape, and its bones in the poses.
-    body = space.shaped(shape_of(space, torch.cat([own, offsets])))
+    body = space.body_of(shape_of(space, torch.cat([own, offsets])))
     transforms = solver.transforms(q, root, body.joints)
     return solver.points(transforms, body.landmarks.nan_to_num())
 

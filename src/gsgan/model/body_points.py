@@ -17,9 +17,9 @@ from gsgan.body import (
     forward_kinematics,
     skin,
 )
-from gsgan.body.lbs import stretched
+from gsgan.body.lbs import stretch_jacobian
 from gsgan.body.skinned import WeightGradients, vertex_normals
-from gsgan.body.subdivide import subdivided
+from gsgan.body.subdivide import subdivide
 from gsgan.model import compiled
 from gsgan.model.interpolation import Interpolation
 from gsgan.model.pose_offsets import PoseOffsets
@@ -327,7 +327,7 @@ class BodyPoints(nn.Module):
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
-            `gsgan.body.lbs.stretched`.
+            `gsgan.body.lbs.stretch_jacobian`.
         stretch_limit: how much longer the stretch makes a Gaussian at most, as a share of its
             length; None: no limit.
         stretch_every: iterations of training between updates of the stretch's terms, which change
@@ -371,7 +371,7 @@ class BodyPoints(nn.Module):
             points = points_for(stature, scale, spacing)
         if points is not None:
             points = whole("model.body_points.points", points, 1)
-            body = subdivided(body, points)
+            body = subdivide(body, points)
 
         # The points, and how Ψ learns with them.
         above("model.body_points.sigma", sigma)
@@ -437,7 +437,7 @@ class BodyPoints(nn.Module):
         return scale * float(self.points.spacing.median())
 
     def stretch_terms(self) -> tuple[Tensor, Tensor]:
-        """Bones and slopes of `gsgan.body.lbs.stretched`, of the weights that move the means."""
+        """Bones and slopes of `gsgan.body.lbs.stretch_jacobian`, for the means' weights."""
         learnt = self.points.learnt
         if learnt is None:
             return self.own_bones, self.own_slopes
@@ -533,7 +533,9 @@ class BodyPoints(nn.Module):
         # Shapes and normals follow the stretch of the surface.
         jacobian = None
         if terms is not None:
-            jacobian = stretched(A, bones, rest, *terms, self.stretch_limit)
+            jacobian = stretch_jacobian(
+                A, bones, rest, *terms, self.stretch_limit
+            )
         normals = move_normals(
             A if jacobian is None else jacobian, self.rest_normals
         )

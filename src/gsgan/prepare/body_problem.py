@@ -163,7 +163,7 @@ class BodyProblem(ABC):
     def solver(self, shared: Tensor) -> Solver:
         """The solver for the body with this shape."""
         solver = Solver(
-            self.space.shaped(shape_of(self.space, shared[self.direct :]))
+            self.space.body_of(shape_of(self.space, shared[self.direct :]))
         )
         of_limb = [LIMB.search(name) is not None for name in solver.rig.names]
         weight = torch.where(torch.tensor(of_limb), LIMB_PRIOR**0.5, 1.0).to(
@@ -315,7 +315,7 @@ class BodyProblem(ABC):
         """
 
         def rest(x: Tensor) -> Tensor:
-            body = self.space.shaped(shape_of(self.space, x))
+            body = self.space.body_of(shape_of(self.space, x))
             return torch.cat(
                 [body.joints[solver.joint], body.landmarks.nan_to_num()]
             )

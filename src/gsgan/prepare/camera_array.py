@@ -62,7 +62,7 @@ class CameraArray:
         """The mean of both focal lengths ``[C]``, pixels."""
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
-    def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
+    def normalise(self, uv: Float) -> tuple[CameraArray, Float]:
         """The cameras with focal lengths of `UNIT_FOCAL` pixels, and matching pixels.
 
         Args:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from gsgan.prepare.camera_array import CameraArray
-from gsgan.prepare.sources import MIN_DECODED, Recording, opened
+from gsgan.prepare.sources import MIN_DECODED, Recording, open_video
 from gsgan.prepare.stages import Advance, StageFolder, each_camera
 from gsgan.skeleton.joints import known
 from gsgan.utils.arrays import Float, Ints, evenly_spaced
@@ -119,7 +119,7 @@ def _cut_off(
 def _times(video: Recording, advance: Advance) -> Float:
     """The times ``[n]`` of all images, seconds from the beginning of the recording."""
     times = []
-    reader = opened(video.path, rotate=False)
+    reader = open_video(video.path, rotate=False)
     while reader.grab():
         times.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         advance(len(times), max(len(times), video.count or 0))
@@ -173,7 +173,7 @@ def moments(time: Float, rate: float) -> tuple[dict[int, int], float]:
     return common, float(apart[list(common)].max(initial=0.0))
 
 
-def renumbered(
+def renumber(
     values: Mapping[int, Value], source: Recording
 ) -> dict[int, Value]:
     """Values by the source's own numbers, such as masks, by common numbers."""

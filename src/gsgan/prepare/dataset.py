@@ -15,7 +15,7 @@ import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.skeletons import usual_step
-from gsgan.prepare.images import scaled
+from gsgan.prepare.images import scale_camera
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.skeleton.joints import BODY, FACE, HANDS, joint_names, known
@@ -41,7 +41,7 @@ class Outcome:
     def cameras(self) -> list[CameraEntry]:
         """The cameras of the written images."""
         refined = self.solution.cameras.entries(self.inputs.cameras)
-        return [scaled(camera, self.options.scale) for camera in refined]
+        return [scale_camera(camera, self.options.scale) for camera in refined]
 
     @property
     def fps(self) -> float:

@@ -122,10 +122,10 @@ def _solution(
     # In thousandths of the focal length, so that images of all sizes count alike.
     C = len(guess)
     images = CameraArray.of(guess)
-    array, pixels = images.normalised(uv)
+    array, pixels = images.normalise(uv)
     per_image = images.focal / array.focal
     flat = pixels.reshape(C, -1, 2)
-    rig = _chained(array, flat, weight.reshape(C, -1), guess)
+    rig = _chain(array, flat, weight.reshape(C, -1), guess)
     near = rig
 
     # Landmarks and cameras together. Detectors swap sides, which a first solution shows.
@@ -172,7 +172,7 @@ def _solution(
     )
 
 
-def _chained(
+def _chain(
     array: CameraArray, uv: Float, weight: Float, guess: list[CameraEntry]
 ) -> CameraArray:
     """The first poses: a pair of cameras, then one camera after the other.
@@ -213,7 +213,7 @@ def _chained(
         views = {}
         for c in set(range(len(array))) - set(placed):
             both = known(points) & (weight[c] > 0)
-            view = _seen_from(points[both], rays[c, both])
+            view = _locate_camera(points[both], rays[c, both])
             if view is not None:
                 views[c] = view
         if not views:
@@ -253,7 +253,9 @@ def _pair(x: Float, y: Float) -> tuple[float, Float, Float] | None:
     return score, np.asarray(R, np.float64), np.ravel(t)
 
 
-def _seen_from(points: Float, rays: Float) -> tuple[int, Float, Float] | None:
+def _locate_camera(
+    points: Float, rays: Float
+) -> tuple[int, Float, Float] | None:
     """How many points agree with a camera's rays at depth 1, and its R and t."""
     if len(points) < MIN_COMMON:
         return None

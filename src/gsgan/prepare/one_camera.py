@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.shape import BodyShape, shape_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.skeletons import usual_step
@@ -23,7 +23,7 @@ from gsgan.prepare.frames import (
     SAMPLING,
     LeftOut,
     check_enough,
-    left_out,
+    find_unusable,
     look,
     sample,
 )
@@ -137,7 +137,7 @@ def solve_video(
         px = detected.px[:, :BODY]
         conf = detected.conf[:, :BODY] * there[:, None]
         sharp, moved = look(list(source.files.values()), px)
-    left = left_out(px, conf, sharp)
+    left = find_unusable(px, conf, sharp)
     check_enough(video, len(numbers), left)
     used = np.flatnonzero(~np.logical_or.reduce(list(left.values())))
 
@@ -182,7 +182,7 @@ def solve_video(
     )
 
     # The numbers and notes of the report.
-    measured = _measured(view, camera, p, time[kept], seen, left)
+    measured = _measure(view, camera, p, time[kept], seen, left)
     measured["background_moved"] = moved
     measured["focal_stated"] = metadata.focal
     measured["hdr"] = metadata.hdr
@@ -322,7 +322,7 @@ def _solve(
 def natural_height(shape: BodyShape) -> float:
     """The height in metres from the soles to the top of the head."""
     plain = BodyShape(shape.coefficients.float(), shape.stretch.float())
-    z = shaped_body(plain).vertices[:, 2]
+    z = shape_body(plain).vertices[:, 2]
     return float(z.max() - z.min())
 
 
@@ -416,7 +416,7 @@ def _with_hands(
     return joints, removed
 
 
-def _measured(
+def _measure(
     view: View,
     camera: CameraEntry,
     p: Float,

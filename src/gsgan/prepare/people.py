@@ -57,7 +57,7 @@ def one_person(
     Raises:
         DataError: when the people of the cameras can hardly ever be joined.
     """
-    several = crowded_frames(detections, offsets)
+    several = find_crowds(detections, offsets)
     if not several:
         return dict(detections), []
 
@@ -103,7 +103,7 @@ def one_person(
     return result, [note]
 
 
-def crowded_frames(
+def find_crowds(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
 ) -> set[int]:
     """The common numbers of frames in which any camera shows several people."""
@@ -182,7 +182,7 @@ def _group(
     both = (weight > 0).sum(0) == len(pair)
     if both.sum() < MIN_JOINTS:
         return None
-    scaled, pixels = rig.normalised(uv)
+    scaled, pixels = rig.normalise(uv)
     p = plain(scaled, pixels, weight)
 
     # In each camera the detection that is nearest.
@@ -217,7 +217,7 @@ def _error(
 ) -> float:
     """The median error of a detection in thousandths of the focal length; infinite if unknown."""
     one = rig[[camera]]
-    scaled, pixels = one.normalised(uv[None])
+    scaled, pixels = one.normalise(uv[None])
     smallest = np.inf
 
     # Detectors may have exchanged left and right, which is corrected later.

@@ -24,7 +24,7 @@ from gsgan.prepare.camera_array import (
     camera_moves,
     undistort_points,
 )
-from gsgan.prepare.clocks import DRIFT, by_time, renumbered, unsteady_clocks
+from gsgan.prepare.clocks import DRIFT, by_time, renumber, unsteady_clocks
 from gsgan.prepare.dataset import (
     Outcome,
     exists,
@@ -47,7 +47,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import crowded_frames, one_person
+from gsgan.prepare.people import find_crowds, one_person
 from gsgan.prepare.solve import Solution, median, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -346,7 +346,7 @@ def _from_several(
     inputs, masks = _with_times(options, inputs, masks, stages)
     inputs, detections = with_detections(inputs, found)
     inputs, detections = with_one_person(options, inputs, detections)
-    frames, uv, conf = _undistorted(options, inputs, detections)
+    frames, uv, conf = _undistort(options, inputs, detections)
 
     # Cameras that are not calibrated, or not in metres.
     if options.calibration == PERSON:
@@ -359,7 +359,7 @@ def _from_several(
     # The joints, and the clocks of the cameras.
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
-    solution = _solved(options, inputs, frames, uv, conf, alphas, console)
+    solution = _solve_frames(options, inputs, frames, uv, conf, alphas, console)
     return Solved(
         inputs=inputs,
         masks=masks,
@@ -428,9 +428,7 @@ def with_detections(
 def in_common(found: Detections, source: Recording) -> Detections:
     """Detections by the frame numbers that all cameras share, in place of the source's own."""
     rows = dict(enumerate(found.frame_id.tolist()))
-    by_number = renumbered(
-        {number: row for row, number in rows.items()}, source
-    )
+    by_number = renumber({number: row for row, number in rows.items()}, source)
     numbers = np.array(sorted(by_number), np.int64)
     at = [by_number[number] for number in numbers.tolist()]
     people = found.people
@@ -449,7 +447,7 @@ def with_one_person(
     """The inputs with a note on other people, and detections of one person."""
     offsets = options.offsets or {}
     if options.calibration == PERSON:
-        several = crowded_frames(detections, offsets)
+        several = find_crowds(detections, offsets)
         if not several:
             return inputs, detections
         note = (
@@ -481,7 +479,7 @@ def _with_times(
         notes=[*inputs.notes, *timed.notes],
     )
     renamed = {
-        name: renumbered(masks[name], source)
+        name: renumber(masks[name], source)
         for name, source in timed.sources.items()
     }
     return in_time, renamed
@@ -547,7 +545,7 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     return parts
 
 
-def _undistorted(
+def _undistort(
     options: Options, inputs: Inputs, detections: dict[str, Detections]
 ) -> tuple[Ints, Float, Float]:
     """The chosen frames ``[F]``; undistorted pixels ``[C, F, J, 2]``, confidence ``[C, F, J]``."""
@@ -646,9 +644,7 @@ def _in_metres(
     # The body's joints in the world of the calibration.
     uv = uv[:, :, :BODY]
     C, F, J = uv.shape[:3]
-    rig, pixels = CameraArray.of(inputs.cameras).normalised(
-        uv.reshape(C, -1, 2)
-    )
+    rig, pixels = CameraArray.of(inputs.cameras).normalise(uv.reshape(C, -1, 2))
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
 
     # The median over frames: single joints may be wrong.
@@ -740,7 +736,7 @@ def _silhouettes(
     )
 
 
-def _solved(
+def _solve_frames(
     options: Options,
     inputs: Inputs,
     frames: Ints,
@@ -749,7 +745,7 @@ def _solved(
     alphas: Mapping[str, Mapping[int, Bytes]],
     console: Console,
 ) -> Solution:
-    """The joints and cameras that fit undistorted pixels, see `_undistorted`."""
+    """The joints and cameras that fit undistorted pixels, see `_undistort`."""
     # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
     C = len(cameras)

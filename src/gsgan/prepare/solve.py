@@ -204,7 +204,7 @@ def solve(
     # Errors are in pixels of cameras of one focal length.
     given = cameras
     to_pixels = (given.focal / UNIT_FOCAL)[:, None, None]
-    cameras, scaled = cameras.normalised(uv)
+    cameras, scaled = cameras.normalise(uv)
     weight = np.where(conf > settings.min_confidence, conf, 0.0)
 
     # Triangulate as detected, then with left and right corrected.
@@ -221,7 +221,7 @@ def solve(
     stages["flips"] = found.points.error
     refined = refine(given, found, outlines, settings)
     if refined.cameras is not given:
-        cameras, _ = refined.cameras.normalised(uv)
+        cameras, _ = refined.cameras.normalise(uv)
         found = correct(cameras, scaled, weight, time)
     stages["refined"] = found.points.error
 
@@ -317,7 +317,9 @@ def refine(
     best = given
     lowest = np.inf
     for weight in LANDMARK_WEIGHTS:
-        cameras = _refined(given, found, fitted, some[::2], weight, settings)
+        cameras = _refine_cameras(
+            given, found, fitted, some[::2], weight, settings
+        )
         after = float(np.nanmedian(frontier_points(cameras, judging).error))
         if after < lowest:
             best = cameras
@@ -327,7 +329,7 @@ def refine(
     return Refined(best, (error, lowest))
 
 
-def _refined(
+def _refine_cameras(
     given: CameraArray,
     found: Corrected,
     outlines: Sequence[Sequence[Outline | None]],
@@ -341,7 +343,7 @@ def _refined(
     to_unit = (UNIT_FOCAL / given.focal)[:, None, None]
     landmarks = _flat(found.uv[:, at, :BODY])
     weight = landmark_weight * _flat(found.weight[:, at, :BODY])
-    unit, _ = given.normalised(landmarks)
+    unit, _ = given.normalise(landmarks)
 
     # The prior pulls towards the given cameras, not towards those of the last round.
     cameras = unit

@@ -19,11 +19,11 @@ from gsgan.render.output import Output
 from gsgan.run.drive import (
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
     inputs_of,
     joints_of,
-    smoothed,
+    smooth,
 )
 from gsgan.run.runs import Run, marks_of
 from gsgan.scene import Camera, cat
@@ -53,12 +53,12 @@ def render_config(config: DictConfig) -> None:
     motion = MotionOptions.from_config(config)
     run = Run.from_config(config)
     if config.distilled:
-        run.avatar = distilled_of(motion, run)
+        run.avatar = distil_run(motion, run)
     for mark in marks_of(run.checkpoint):
         console.print(mark, markup=False, highlight=False, soft_wrap=True)
 
     # The motion, and the camera of each frame.
-    drive = smoothed(config.smooth, drive_of(motion, run, fps), fps)
+    drive = smooth(config.smooth, drive_of(motion, run, fps), fps)
     drive = _chosen(drive, config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
@@ -199,7 +199,7 @@ def of_entry(
         p: ``[F, 33, 3]`` metres, world frame.
         size: pixels.
         crop: of the training images, or None.
-        lens: keep its distortion, see `CameraEntry.seen`.
+        lens: keep its distortion, see `CameraEntry.view_of`.
     """
     # One window for all frames, so that the camera stands still.
     window = square_window(entry.size)
@@ -208,7 +208,7 @@ def of_entry(
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
         kept = lens and entry.keeps_lens
         window = crop.window(entry, joints, known, lens=kept)
-    return entry.seen(window, (size, size), lens=lens)
+    return entry.view_of(window, (size, size), lens=lens)
 
 
 def from_file(

@@ -33,7 +33,7 @@ from gsgan.model.generator import Generator
 from gsgan.model.residual_gaussians import ResidualGaussians
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.run.class_vote import labelled_body
+from gsgan.run.class_vote import label_body
 from gsgan.scene import Frame
 from gsgan.skeleton import Densify, SkeletonTemplate, template_of
 from gsgan.splat import BACKENDS, Accuracy
@@ -119,8 +119,8 @@ def build_avatar(
             "the model leaves it out",
         )
         if parts.segmentation is not None:
-            labelled = labelled_body(scene, images, vertex_labels)
-        return _assembled(parts, scene, effects, labelled, config.seed)
+            labelled = label_body(scene, images, vertex_labels)
+        return _assemble(parts, scene, effects, labelled, config.seed)
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class AvatarParts:
         )
 
 
-def _assembled(
+def _assemble(
     parts: AvatarParts,
     scene: SceneInfo,
     effects: Effects,
@@ -229,7 +229,7 @@ def _assembled(
             **_set_by_scene(parts, scene, effects, body_points),
         )
     if parts.surface:
-        body = _required_body(scene, "model.surface")
+        body = _require_body(scene, "model.surface")
         surface = parts.surface(body=body, **sizes)
 
     # S forms its images like F.
@@ -244,7 +244,7 @@ def _assembled(
     # Parts on a body need its solver for skeletons without a body pose.
     solver = None
     if body_points or surface or segmentation:
-        solver = Solver(_required_body(scene, "the model"))
+        solver = Solver(_require_body(scene, "the model"))
 
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
@@ -289,7 +289,7 @@ def _body_points(
     if not (parts.densify and parts.body_points and effects.body_points.on):
         return None
     return parts.body_points(
-        body=_required_body(scene, "effects.body_points=on"),
+        body=_require_body(scene, "effects.body_points=on"),
         stature=stature,
         scale=scene.scale_train[1],
     )
@@ -368,7 +368,7 @@ def naming_group(group: str) -> Iterator[None]:
         ) from error
 
 
-def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
+def _require_body(scene: SceneInfo, part: str) -> MarkedBody:
     if not scene.has_body_pose:
         raise DataError(
             f"{part} cannot be built: the data lacks a body pose for every frame; choose "

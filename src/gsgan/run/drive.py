@@ -147,11 +147,11 @@ def drive_of(options: MotionOptions, run: Run, fps: float) -> Drive:
         DataError: when the motion cannot be read.
     """
     # With drive=skeleton the body follows from the joints, as for a motion without one.
-    found = _chosen(options, run, fps)
+    found = _choose(options, run, fps)
     return found if options.drive is None else replace(found, body=None)
 
 
-def smoothed(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
+def smooth(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
     """The motion after the filter of the config group ``smooth``, if it is enabled.
 
     Joints are smoothed from the past alone. Body poses follow from them.
@@ -163,25 +163,25 @@ def smoothed(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
     own = dict(settings)
     if not own.pop("enabled"):
         return drive
-    smooth = OneEuro(**own)
+    one_euro = OneEuro(**own)
 
     # Held-out frames may be apart; then the filter starts anew.
     joints = []
     for number, p in zip(drive.numbers, drive.p, strict=True):
-        joints.append(smooth(p, number / fps))
+        joints.append(one_euro(p, number / fps))
     return replace(
         drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed"
     )
 
 
-def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
+def _choose(options: MotionOptions, run: Run, fps: float) -> Drive:
     """The motion of options: files, a split, the rest pose, or one held-out frame."""
     # Without a motion: one held-out frame, held still. A shared avatar has no frames.
     if options.motion is None and run.is_shared:
         return rest_pose(run.proportions)
     if options.motion is None:
         split, _ = run.data.watched
-        found = _held_out(options, run, split)
+        found = _read_split(options, run, split)
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
         return replace(
@@ -197,17 +197,17 @@ def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
         clips = [
             _from_file(options, run, str(path), fps) for path in options.motion
         ]
-        return _joined(clips, run.proportions, options.transition, fps)
+        return _join(clips, run.proportions, options.transition, fps)
 
     # A name, or else a file.
     if options.motion == REST:
         return rest_pose(run.proportions)
     if options.motion in SPLITS:
-        return _held_out(options, run, options.motion)
+        return _read_split(options, run, options.motion)
     return _from_file(options, run, options.motion, fps)
 
 
-def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
+def _read_split(options: MotionOptions, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = run.data.dataset(split)
     if not dataset.items:
@@ -259,7 +259,7 @@ def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
     )
 
 
-def _joined(
+def _join(
     clips: list[Drive], proportions: Proportions, seconds: float, fps: float
 ) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
@@ -287,14 +287,14 @@ def _joined(
     names = "; ".join(clip.text for clip in clips)
     return Drive(
         p=p,
-        visibility=_shown(p, proportions),
+        visibility=_make_visibility(p, proportions),
         body=None,
         numbers=list(range(len(p))),
         text=f"{names}; {seconds:g} s from each to the next",
     )
 
 
-def _shown(p: Float, proportions: Proportions) -> Float:
+def _make_visibility(p: Float, proportions: Proportions) -> Float:
     """Visibility ``[F, J]`` of retargeted joints: the body's as in training, 1 for others that are
     known."""
     # The body's landmarks are as visible as they were in training.
@@ -331,7 +331,7 @@ def _from_file(
             body = motion.body[torch.from_numpy(nearest)]
     else:
         p = _on_subject(options, run, motion, up, rate, fps)
-        visibility = _shown(p, run.proportions)
+        visibility = _make_visibility(p, run.proportions)
 
     # One line on what was read and what was made of it.
     bones = "bones as they are" if own else "on the subject's bones"
@@ -488,7 +488,7 @@ def inputs_of(
     return p, visibility, avatar.body_pose(p, visibility)
 
 
-def distilled_of(options: MotionOptions, run: Run) -> Avatar:
+def distil_run(options: MotionOptions, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
     `gsgan.model.harmonic.distil`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.

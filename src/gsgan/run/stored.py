@@ -237,7 +237,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
+def read_scene(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
     # Checkpoints hold lists for tuples, and dicts for dataclasses.
     values: dict[str, Any] = {}

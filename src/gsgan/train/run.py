@@ -25,7 +25,7 @@ from rich.console import Console
 
 from gsgan.body.turns import PoseCorrections
 from gsgan.data.datamodule import GsganData
-from gsgan.evaluate.origin import trained, training_code
+from gsgan.evaluate.origin import read_method, training_code
 from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.page import refuse_unsuitable
@@ -258,7 +258,7 @@ def build_training(
     with working(console, "measuring the scene"):
         info = data.info
     with working(console, "building the avatar"):
-        avatar = build_avatar(config, info, data.labelled("train"))
+        avatar = build_avatar(config, info, data.select_labelled("train"))
         _store_poses(avatar, data)
     # the same start beside every avatar
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
@@ -405,7 +405,7 @@ def _evaluate(
     module.to(device)
 
     # Facts about the training are written beside the scores.
-    method = trained(
+    method = read_method(
         folder,
         seed=options.seed,
         iterations=module.step,

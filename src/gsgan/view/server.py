@@ -18,9 +18,9 @@ from gsgan.run.drive import (
     REST,
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
-    smoothed,
+    smooth,
 )
 from gsgan.run.runs import Run
 from gsgan.skeleton.proportions import upright
@@ -79,12 +79,12 @@ class Viewer:
         self.run = Run.from_config(config)
         fps = float(above("fps", config.fps))
         if config.distilled:
-            self.run.avatar = distilled_of(options, self.run)
+            self.run.avatar = distil_run(options, self.run)
 
         def read(motion: str) -> Drive:
             chosen = replace(options, motion=motion)
             drive = drive_of(chosen, self.run, fps)
-            return smoothed(config.smooth, drive, fps)
+            return smooth(config.smooth, drive, fps)
 
         # The settings and the first motion of all browsers.
         first = REST if self.run.is_shared else self.run.data.watched[0]
