@@ -77,7 +77,7 @@ def truth(
     for clip in clips:
         motion = animation(character, clip)
         for R, joints in zip(motion.rotations, motion.joints, strict=True):
-            vertices = character.skinned(R, joints)[0]
+            vertices = character.skin(R, joints)[0]
             marks.append(character.landmarks(vertices, joints)[:JOINTS])
             points.append(vertices[chosen])
     return tuple(torch.from_numpy(np.stack(x)).float() for x in (marks, points))

@@ -84,7 +84,7 @@ def main() -> None:
 
     def surface(at):
         skinned = (
-            scene.character.skinned(R, p, 0)[0]
+            scene.character.skin(R, p, 0)[0]
             for R, p in zip(at.rotations, at.joints, strict=True)
         )
         return np.stack([v[keep] for v in skinned])

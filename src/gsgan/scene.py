@@ -280,7 +280,7 @@ class Frame(TensorRecord):
             self.camera_index,
         )
 
-    def unpacked(self) -> Frame:
+    def unpack(self) -> Frame:
         """The frame with images in [0, 1] and labels as int64, of one whose pixels are bytes.
 
         A quarter to an eighth as much is then loaded and moved to a device.

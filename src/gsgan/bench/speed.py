@@ -241,7 +241,9 @@ def without_denormals() -> Iterator[None]:
         torch.set_flush_denormal(False)
 
 
-def timed(action: Callable[[], object], device: torch.device | None) -> float:
+def measure_ms(
+    action: Callable[[], object], device: torch.device | None
+) -> float:
     """Milliseconds of one call, device synchronised."""
     # Kernels run asynchronously: the clock starts and stops when the device is idle.
     wait(device)
@@ -300,7 +302,7 @@ def measure(
         # End to end: the device is synchronised only at the end.
         frame = frames[i % len(frames)]
         clock = StageClock(device)
-        total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+        total = measure_ms(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         tick()
         if i < 0:
             continue
@@ -308,7 +310,7 @@ def measure(
         # The same frame by stage, with the device synchronised after each.
         avatar.stage = clock
         try:
-            staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+            staged = measure_ms(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
             avatar.stage = watch_nothing
 
@@ -337,7 +339,7 @@ def in_batches(
     for _ in range(0, count, size):
         groups.append(cat(list(islice(repeated, size))))
     return deciles(
-        [timed(partial(painter, group), device) / size for group in groups]
+        [measure_ms(partial(painter, group), device) / size for group in groups]
     )
 
 

@@ -18,12 +18,12 @@ from gsgan.check.calibration import (
     score_cameras,
 )
 from gsgan.check.frames import (
+    format_ranges,
     frame_findings,
     mask_doubts,
-    shortened,
     skeleton_doubts,
 )
-from gsgan.check.report import Figure, Finding, Section, Table, counted
+from gsgan.check.report import Figure, Finding, Section, Table, count_of
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import CheckedData
 from gsgan.data.formats.consistency import camera_distances, far_cameras, spread
@@ -208,7 +208,7 @@ class Measurements:
         self.subject = subject
 
         # The sampled images, and those that were cut off; all are decoded once.
-        items = views.sampled_items(subject, sampling.images)
+        items = views.sample_items(subject, sampling.images)
         items += views.cut_items(subject, sampling.images)
         self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
@@ -277,7 +277,7 @@ def sections(m: Measurements) -> Sequence[Section]:
 
     # One strip of images per camera.
     strips = []
-    for name, own in views.grouped(m.views).items():
+    for name, own in views.group_by_camera(m.views).items():
         shown = spread(own, m.sampling.shown)
         image = overlays.strip(m.subject, shown, m.reasons)
         strips.append(Figure(f"camera {name}", image))
@@ -308,7 +308,7 @@ def _contents(m: Measurements) -> Section:
     contents = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
-        ("frames", f"{len(frames)}: {shortened(frames)}"),
+        ("frames", f"{len(frames)}: {format_ranges(frames)}"),
         (
             "images",
             f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)",
@@ -340,7 +340,7 @@ def _contents(m: Measurements) -> Section:
         lacking = sorted(set(frames) - set(files))
         if lacking:
             # Long lists of numbers are shortened to ranges.
-            text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
+            text = f"{len(lacking)} of the {len(frames)} frames: {format_ranges(lacking)}"
             found.append(
                 Finding("warning", "files", f"camera {name} lacks {text}")
             )
@@ -374,8 +374,8 @@ def _split(data: GsganData, name: str) -> str:
     items = data.splits.items[name]
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
-    cameras = counted(len(items.cameras), "camera")
-    return f"{counted(len(items), 'image')}: {cameras}, frames {shortened(items.frames)}"
+    cameras = count_of(len(items.cameras), "camera")
+    return f"{count_of(len(items), 'image')}: {cameras}, frames {format_ranges(items.frames)}"
 
 
 def _agreement(m: Measurements) -> Section:
@@ -430,8 +430,8 @@ def _frames(m: Measurements) -> Section:
     if rows:
         tables = (Table(("frame", "why"), rows[:TABLE_FRAMES]),)
     text = (
-        f"{counted(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
-        f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
+        f"{count_of(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
+        f"frames, masks in {count_of(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
     findings = frame_findings(m.subject, m.doubts, m.limits)

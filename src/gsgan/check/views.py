@@ -174,7 +174,7 @@ class MaskView:
         return 1 - self.beyond.sum() / known if known else np.nan
 
 
-def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
+def group_by_camera(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     """The views by camera."""
     groups: dict[str, list[MaskView]] = {}
     for view in views:
@@ -182,7 +182,7 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     return groups
 
 
-def sampled_items(subject: CheckedData, images: int) -> list[Item]:
+def sample_items(subject: CheckedData, images: int) -> list[Item]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
     # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))

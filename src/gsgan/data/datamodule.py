@@ -487,7 +487,7 @@ class GsganData(LightningDataModule):
         self, batch: Frame, device: torch.device, dataloader_idx: int
     ) -> Frame:
         """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
-        return batch.to(device, non_blocking=True).unpacked()
+        return batch.to(device, non_blocking=True).unpack()
 
     def _loader(
         self,

@@ -61,7 +61,7 @@ class ImageCache(LRUCache[Item, DecodedImage]):
 class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
-    With ``packed`` images, masks and labels stay bytes, see `Frame.unpacked`.
+    With ``packed`` images, masks and labels stay bytes, see `Frame.unpack`.
 
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
     undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
@@ -157,7 +157,7 @@ class CaptureDataset(Dataset[Frame]):
             labels=labels,
             unsure=unsure,
         )
-        return found if self.packed else found.unpacked()
+        return found if self.packed else found.unpack()
 
     def mask(self, index: int) -> tuple[Bytes, Bytes | None]:
         """The mask ``[H, W]`` of an item and its unsure pixels, 0..255; reads no image.

@@ -112,7 +112,7 @@ class EffectSettings:
                 f"effects.only must list some of {', '.join(CHOICES)}; got {listed}"
             )
 
-    def requested(self, name: str) -> str | int:
+    def value_of(self, name: str) -> str | int:
         """The value requested for an effect, with ``only`` taken into account."""
         # Without `only` every effect is as requested.
         value: str | int = getattr(self, name)
@@ -189,7 +189,7 @@ def _one(
     body_points: Effect | None = None,
 ) -> Effect:
     # Off by request.
-    requested = settings.requested(name)
+    requested = settings.value_of(name)
     off: str | int = 0 if name == "view_dependence" else OFF
     if requested in (OFF, 0):
         return Effect(off, FORCED)

@@ -20,7 +20,7 @@ from gsgan.metrics.regions import (
     BACKGROUNDS,
     box_corners,
     box_mask,
-    cleared,
+    clear,
     eight_bits,
     hands_and_mouth,
     hard_outline,
@@ -159,7 +159,7 @@ class Preparation:
         # Rounding, then clearing, as the scoring scripts do.
         image = eight_bits(image, self.measures.eight_bits)
         if box is not None and self.measures.region == "body_box_cleared":
-            image = cleared(image, box, background)
+            image = clear(image, box, background)
         return image
 
     def box(self, frame: Frame) -> Tensor | None:

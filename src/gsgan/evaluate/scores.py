@@ -44,7 +44,7 @@ from gsgan.metrics.names import (
 )
 from gsgan.metrics.regions import (
     BACKGROUNDS,
-    cleared,
+    clear,
     describe_boxes,
     rectangle,
 )
@@ -121,8 +121,8 @@ def image_scores(
         scores["ssim"] = _inside(
             box,
             similarity,
-            cleared(image, box, background),
-            cleared(target, box, background),
+            clear(image, box, background),
+            clear(target, box, background),
         )
     else:
         scores["psnr"] = psnr(image, target, pooling=pooling)

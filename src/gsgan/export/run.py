@@ -21,8 +21,8 @@ from gsgan.export.hub import (
 from gsgan.export.motions import (
     BodyMotion,
     bvh_text,
-    captured_motion,
     motion_glb,
+    read_captured,
 )
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import (
@@ -157,7 +157,7 @@ def _write_poses(
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     frames = track(range(len(drive.p)), "writing", console)
     if kind == "usd":
-        poses = (_posed(run, drive, i) for i in frames)
+        poses = (_pose_frame(run, drive, i) for i in frames)
         fps = float(config.fps)
         _write(out, usd_bytes(poses, fps, run.proportions.up))
         return
@@ -301,7 +301,7 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
     fps = float(above("fps", config.fps))
     if config.capture is not None:
         capture = Path(config.capture).expanduser()
-        return captured_motion(capture, config.data_smpl, fps)
+        return read_captured(capture, config.data_smpl, fps)
 
     # The body that the avatar moves with, whose poses are those of the motion or solved.
     run = Run.from_config(config, device="cpu")
@@ -321,7 +321,7 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
 
 
 @torch.no_grad()
-def _posed(run: Run, drive: Drive, i: int) -> Splats:
+def _pose_frame(run: Run, drive: Drive, i: int) -> Splats:
     """The Gaussians of frame i."""
     p, visibility, body = inputs_of(run.avatar, drive, i)
     return splats_of(run.avatar, p, visibility > 0, body)
@@ -329,7 +329,7 @@ def _posed(run: Run, drive: Drive, i: int) -> Splats:
 
 def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
     """The content of a .ply, .splat, .spz or .glb file of frame i."""
-    splats = _posed(run, drive, i)
+    splats = _pose_frame(run, drive, i)
     if kind == "gltf":
         return glb_bytes(splats, run.proportions.up)
     if kind == "splat":

@@ -49,7 +49,7 @@ from gsgan.skeleton import (
 )
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.splat import Accuracy, rasterise
-from gsgan.utils.tensors import filled, full_precision
+from gsgan.utils.tensors import fill, full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
 # entering it costs next to nothing
@@ -248,7 +248,7 @@ class Avatar(nn.Module):
         if self.generator is None and self.deformation is not None:
             self.deformation.active_features = 0
 
-        # Every part gets a store, in which `gsgan.utils.tensors.derived` keeps its results.
+        # Every part gets a store, in which `gsgan.utils.tensors.derive` keeps its results.
         for part in self.modules():
             part.derived = {}  # type: ignore[assignment]
         return self.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -298,7 +298,7 @@ class Avatar(nn.Module):
         rendering = self(p, seen, cameras.to("cpu"), body, maps=False)
         assert rendering.image is not None
         assert rendering.alpha is not None
-        colour = filled(background, rendering.image).expand(3).view(1, 3, 1, 1)
+        colour = fill(background, rendering.image).expand(3).view(1, 3, 1, 1)
         image = rendering.image.clamp(0, 1)
         return (image + (1 - rendering.alpha.clamp(0, 1)) * colour).clamp(0, 1)
 

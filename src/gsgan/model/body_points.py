@@ -26,7 +26,7 @@ from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, at_least, whole
-from gsgan.utils.tensors import derived, farthest_points, matvec, squared_norm
+from gsgan.utils.tensors import derive, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
 NORMAL_FLOOR = 1e-2
@@ -162,7 +162,7 @@ class LearntWeights(nn.Module):
             )
             return (self.start + moved.view_as(self.start)).softmax(1)
 
-        return derived(self, "weights", make, self.field)
+        return derive(self, "weights", make, self.field)
 
 
 class SkinnedPoints(nn.Module):
@@ -303,7 +303,7 @@ class SkinnedGaussians(nn.Module):
             ) * log_scales.exp().unsqueeze(-2)
 
         # Covariances A Σ Aᵀ, from the transformed axes.
-        axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
+        axes = A @ derive(self, "axes", make, *self.parameters(recurse=False))
         opacities = torch.sigmoid(logits).expand(len(A), -1)
         return Gaussians(
             means, None, None, opacities, features, covariances=axes @ axes.mT
@@ -447,7 +447,7 @@ class BodyPoints(nn.Module):
 
         # A trained avatar computes the terms once for its weights.
         if not self.training:
-            return derived(self, "terms", make, learnt.field)
+            return derive(self, "terms", make, learnt.field)
 
         # In training the terms are kept for `stretch_every` iterations and have no gradient.
         if self._terms is None or self._age == self.stretch_every:

@@ -15,9 +15,9 @@ from gsgan.model.light import LIGHT_RATE, SharedLight
 from gsgan.model.residual_gaussians import ResidualGaussians, Residuals
 from gsgan.skeleton import Points
 from gsgan.skeleton.densify import rows_of
-from gsgan.splat.sh import brightened
+from gsgan.splat.sh import brighten
 from gsgan.utils.checks import between, whole
-from gsgan.utils.tensors import derived, farthest_points
+from gsgan.utils.tensors import derive, farthest_points
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
@@ -234,7 +234,7 @@ class Deformation(ResidualGaussians):
         normals = points.normals
         if chosen is not None:
             normals = rows_of(normals, chosen)
-        sh = brightened(residuals.sh, self.light(normals, lit))
+        sh = brighten(residuals.sh, self.light(normals, lit))
         return replace(residuals, sh=sh)
 
     def _at_points(self, values: Tensor, chosen: Tensor | None) -> Tensor:
@@ -316,7 +316,7 @@ class Deformation(ResidualGaussians):
             found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
             return found
 
-        return derived(
+        return derive(
             self,
             "point part",
             make,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.utils.checks import one_of
-from gsgan.utils.tensors import derived, full_precision
+from gsgan.utils.tensors import derive, full_precision
 
 # inside the root: an all-zero pixel (empty background) stays zero
 NORM_FLOOR = 1e-6
@@ -145,10 +145,10 @@ class DecoderLevel(nn.Module):
         """
         # The kernel has a part for the upsampled map, and one for the skip.
         C = h.shape[1]
-        kernel = derived(
+        kernel = derive(
             self, "upper", lambda: upsampling_kernel(weight[:, :C]), weight
         )
-        lower = derived(
+        lower = derive(
             self, "lower", lambda: channels_last(weight[:, C:]), weight
         )
 
@@ -351,12 +351,12 @@ class Generator(nn.Module):
 
         # The part for F; with fine pixels it has a stride and padding in these.
         if fine is None:
-            kernel = derived(
+            kernel = derive(
                 self, "F", lambda: channels_last(weight[:, :C]), weight
             )
             h = functional.conv2d(features, kernel, bias, stride, padding)
         else:
-            kernel = derived(
+            kernel = derive(
                 self, "fine", lambda: fine_kernel(weight, C, k), weight
             )
             fine = self._pad(fine, k)
@@ -366,7 +366,7 @@ class Generator(nn.Module):
         first = C
         for i, given in enumerate(others):
             part = weight[:, first : first + given.shape[1]]
-            kernel = derived(
+            kernel = derive(
                 self, f"part {i}", partial(channels_last, part), weight
             )
             h += functional.conv2d(

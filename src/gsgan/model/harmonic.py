@@ -17,7 +17,7 @@ from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.tensors import derived
+from gsgan.utils.tensors import derive
 
 HARMONICS = 9  # of degrees 0, 1 and 2
 RIDGE = 0.02
@@ -132,7 +132,7 @@ class Harmonic(ResidualGaussians):
         given = list(self.slopes.values())
         parts = {}
         if given:
-            slopes = derived(
+            slopes = derive(
                 self, "slopes", lambda: torch.cat(given, dim=-1), *given
             )
             # a product with N small matrices takes longer

@@ -150,7 +150,7 @@ def _read_skeleton(path: Path) -> _Skeleton:
 
     # The bones.
     bones = {ROOT: _Bone(root, radians)}
-    for words in _described_bones(sections["bonedata"]):
+    for words in _parse_bones(sections["bonedata"]):
         name = words["name"][0]
         bones[name] = _Bone(words, radians)
 
@@ -185,7 +185,7 @@ def _refuse_cut(name: str, lines: list[list[str]]) -> None:
         raise ValueError(f"its section :{name} is cut off: a begin has no end")
 
 
-def _described_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:
+def _parse_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:
     """The values of each bone by key; the first ones of each key count."""
     described = []
     bone: dict[str, list[str]] = {}

@@ -51,7 +51,7 @@ class Character:
     anchor_joint: Ints
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
 
-    def skinned(
+    def skin(
         self, rotations: Array, joints: Array, offsets: Array | None = None
     ) -> tuple[Array, Array]:
         """Vertices and normals ``[V, 3]`` of one pose, by linear blend skinning.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.motion.clip import rate_of
-from gsgan.skeleton.joints import BODY, known, zeros_as_missing
+from gsgan.skeleton.joints import BODY, is_known, zeros_as_missing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 from gsgan.utils.files import read_text
@@ -95,7 +95,7 @@ def read_points3d(path: Path) -> Points3D:
     p = p[order]
 
     # A joint without all coordinates is missing.
-    seen = known(p)
+    seen = is_known(p)
     return Points3D(
         frames=found.frames[order],
         p=np.where(seen[..., None], p, np.nan),

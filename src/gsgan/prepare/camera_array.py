@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import undistort
 from gsgan.scene import NEAR
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2
@@ -136,7 +136,7 @@ def film_camera(name: str, size: tuple[int, int], focal: float) -> CameraEntry:
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
     """Pixels ``px [..., 2]`` without lens distortion; K stays, skew included. NaN stays NaN."""
-    seen = known(px)
+    seen = is_known(px)
     if not camera.distorted or not seen.any():
         return np.asarray(px, np.float64)
     # Rays at a depth of 1, where the lens has its distortion.
@@ -181,8 +181,8 @@ def refine_cameras(
         focal_prior: standard deviation of the logarithms of its focal lengths; None fixes them.
     """
     # The points that are used.
-    weight = np.where(known(uv), weight, 0.0)
-    use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
+    weight = np.where(is_known(uv), weight, 0.0)
+    use = is_known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p = p[use]
     uv = uv[:, use]
     weight = weight[:, use]

@@ -10,7 +10,7 @@ import numpy as np
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.sources import MIN_DECODED, Recording, open_video
 from gsgan.prepare.stages import Advance, StageFolder, each_camera
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Float, Ints, evenly_spaced
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz
@@ -215,7 +215,7 @@ def clock_errors(
         return delay, gain
 
     # The rays of all detections, in the world.
-    seen = known(uv) & (weight > 0)
+    seen = is_known(uv) & (weight > 0)
     px = np.where(seen[..., None], uv, np.nan)
     homogeneous = np.concatenate([px, np.ones((*px.shape[:-1], 1))], axis=-1)
     inverse = np.linalg.inv(cameras.K @ cameras.R)

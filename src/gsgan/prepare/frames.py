@@ -9,7 +9,7 @@ import numpy as np
 from gsgan.data.skeletons import HUBS
 from gsgan.prepare.images import JPEG_QUALITY
 from gsgan.prepare.sources import Recording, open_video, video_recording
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
@@ -180,7 +180,7 @@ def find_unusable(px: Float, conf: Float, sharp: Float) -> LeftOut:
 
 def extents(px: Float) -> Float:
     """The diagonal ``[F]`` of the box around the seen landmarks ``[F, 33, 2]``; NaN without any."""
-    seen = known(px)
+    seen = is_known(px)
     lower = np.where(seen[..., None], px, np.inf).min(1)
     upper = np.where(seen[..., None], px, -np.inf).max(1)
     size = np.linalg.norm(upper - lower, axis=-1)
@@ -199,7 +199,7 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
         image = read_grey(path)
 
         # The box of the person, in which sharpness is measured.
-        seen = px[f][known(px[f])]
+        seen = px[f][is_known(px[f])]
         box = np.zeros(4, np.int64)
         if len(seen):
             box = np.r_[seen.min(0), seen.max(0)].astype(np.int64)

@@ -22,7 +22,7 @@ from gsgan.prepare.camera_array import (
 )
 from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.triangulate import robust
-from gsgan.skeleton.joints import BODY, FLIP_GROUPS, known
+from gsgan.skeleton.joints import BODY, FLIP_GROUPS, is_known
 from gsgan.utils.arrays import Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -81,7 +81,7 @@ def calibrate_from_person(
     # Frames with the person in two cameras, evenly spaced.
     uv = uv[:, :, :BODY]
     weight = np.where(
-        known(uv) & (conf[:, :, :BODY] > SEEN_CONFIDENCE), 1.0, 0.0
+        is_known(uv) & (conf[:, :, :BODY] > SEEN_CONFIDENCE), 1.0, 0.0
     )
     shared = np.flatnonzero((weight.sum(2) > 0).sum(0) >= 2)
     frames = shared[evenly_spaced(len(shared), USED_FRAMES)]
@@ -151,7 +151,7 @@ def _solution(
     # Errors in pixels of the images, and angles between rays.
     flat = sided.reshape(C, -1, 2)
     found = robust(rig, flat, seen.reshape(C, -1))
-    used = known(found.p)
+    used = is_known(found.p)
     if not used.any():
         raise DataError(
             "calibration=person: no landmark is seen alike by two cameras; do frame numbers agree?"
@@ -212,7 +212,7 @@ def _chain(
         points = robust(rig[placed], uv[placed], weight[placed]).p
         views = {}
         for c in set(range(len(array))) - set(placed):
-            both = known(points) & (weight[c] > 0)
+            both = is_known(points) & (weight[c] > 0)
             view = _locate_camera(points[both], rays[c, both])
             if view is not None:
                 views[c] = view

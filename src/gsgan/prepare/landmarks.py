@@ -20,7 +20,7 @@ from gsgan.skeleton.joints import (
     LEFT,
     RIGHT,
     SETS,
-    known,
+    is_known,
 )
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
@@ -101,7 +101,7 @@ def read_detections(path: Path) -> Detections:
     # Frames are sorted; NaN, infinity or no confidence mean that a landmark is not seen.
     found = _read_json(path) if path.is_dir() else _read_npz(path)
     order = np.argsort(found.frame_id)
-    conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
+    conf = np.where(is_known(found.px), np.nan_to_num(found.conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
     px = np.where(conf[..., None] > 0, found.px[order], np.nan)
 
@@ -325,7 +325,7 @@ def _joints(
 
     def put(joints: list[int], triples: Float) -> None:
         confidence = triples[:, 2]
-        seen = known(triples) & (confidence > 0)
+        seen = is_known(triples) & (confidence > 0)
         px[joints] = np.where(
             seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan
         )

@@ -12,7 +12,7 @@ from gsgan.prepare.camera_array import CameraArray, undistort_points
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.joints import BODY, known
+from gsgan.skeleton.joints import BODY, is_known
 from gsgan.utils.arrays import Float
 from gsgan.utils.errors import DataError
 
@@ -137,7 +137,7 @@ def _people(
     people = alone if found.people is None else found.people[row]
     result = []
     for px, conf in people:
-        seen = known(px[:BODY]) & (conf[:BODY] > 0)
+        seen = is_known(px[:BODY]) & (conf[:BODY] > 0)
         uv = undistort_points(camera, px[:BODY])
         result.append((uv, np.where(seen, conf[:BODY], 0.0)))
     return result
@@ -206,7 +206,7 @@ def _group(
             confidence += share * float(candidates[best][1].sum())
 
     # Its place and size.
-    there = p[known(p)]
+    there = p[is_known(p)]
     size = float(np.linalg.norm(np.ptp(there, axis=0)))
     centre = np.median(there, axis=0)
     return _Group(tuple(chosen), centre, size, confidence)

@@ -53,11 +53,11 @@ from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
-from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
+from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, is_known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
-from gsgan.utils.errors import DataError, explained
+from gsgan.utils.errors import DataError, explain
 from gsgan.utils.files import read_json, write_json
-from gsgan.utils.frame_files import shifted_numbers
+from gsgan.utils.frame_files import find_shifts
 from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
@@ -103,7 +103,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     dropped = [frame for frame in frames if frame not in kept]
 
     # The share of frames in which each joint came out in 3D.
-    found = known(solution.p[:, :BODY]).mean(0)
+    found = is_known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {
             stage: median(px) for stage, px in solution.stages.items()
@@ -351,7 +351,7 @@ def _from_several(
     # Cameras that are not calibrated, or not in metres.
     if options.calibration == PERSON:
         people = [note for note in inputs.notes if "several people" in note]
-        with explained(people[-1] if people else None):
+        with explain(people[-1] if people else None):
             inputs = _from_person(options, inputs, frames, uv, conf, console)
     if not inputs.calibration.metric:
         inputs = _in_metres(options, inputs, uv, conf)
@@ -388,7 +388,7 @@ def _with_shifts(
     notes = [*inputs.notes]
     for name, source in inputs.sources.items():
         others = {f"its {what}": numbers[name]}
-        for note in shifted_numbers(source.numbers(), others):
+        for note in find_shifts(source.numbers(), others):
             notes.append(note.replace("doubtful: ", f"doubtful: {name}: "))
     return replace(inputs, notes=notes)
 
@@ -648,7 +648,7 @@ def _in_metres(
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
 
     # The median over frames: single joints may be wrong.
-    seen = torch.from_numpy(known(p))
+    seen = torch.from_numpy(is_known(p))
     limbs = limb_length_sum(
         torch.from_numpy(np.nan_to_num(p)), seen
     ).nanmedian()
@@ -769,7 +769,7 @@ def _solve_frames(
 def _check_distance(inputs: Inputs, p: Float) -> None:
     """Refuses a capture whose cameras are implausibly near or far; NaN in ``p [N, 3]``: missing."""
     where = inputs.calibration.path
-    seen = p[known(p)]
+    seen = p[is_known(p)]
     if not len(seen):
         raise DataError(
             f"{where}: no joint was seen by two cameras; do frame numbers agree?"
@@ -787,7 +787,7 @@ def _write_images(
 
     # Frames without a joint of the body are left out; hands and a face alone are no person.
     body = [joint for joint in range(BODY) if joint not in FROM_PARTS]
-    has_joint = known(solution.p[:, body]).any(1)
+    has_joint = is_known(solution.p[:, body]).any(1)
     posed = set(solved.frames[has_joint].tolist())
     if not posed:
         raise DataError(

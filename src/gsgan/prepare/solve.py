@@ -38,7 +38,7 @@ from gsgan.skeleton.joints import (
     HAND_PAIRS,
     HANDS,
     WRIST_JOINTS,
-    known,
+    is_known,
 )
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 from gsgan.utils.checks import above, at_least, whole
@@ -232,14 +232,14 @@ def solve(
     smoothed = smooth(p, agreed, time, settings.smoothing)
 
     # A body in smooth motion, from the views of all cameras.
-    seen = known(p)
+    seen = is_known(p)
     if settings.body and seen[:, SHOULDERS].all(1).any():
         smoothed[:, :BODY] = body_joints(
             cameras, found.uv, found.weight, p, time, settings.noise
         )
     p = smoothed
     conf_seen = _mean_seen(found.weight, found.weight)
-    inferred = np.where(known(p), INFERRED, 0.0)
+    inferred = np.where(is_known(p), INFERRED, 0.0)
 
     # The final errors, of detections that were used.
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv))
@@ -262,7 +262,7 @@ def solve(
     return Solution(
         cameras=chosen,
         p=p,
-        conf=np.where(seen & known(p), conf_seen, inferred),
+        conf=np.where(seen & is_known(p), conf_seen, inferred),
         seen=seen,
         error=error * to_pixels,
         flips=found.flips,
@@ -351,7 +351,7 @@ def _refine_cameras(
         now = replace(given, R=cameras.R, t=cameras.t)
         touching = to_unit * frontier_points(now, outlines).uv
         both = np.concatenate([landmarks, touching], axis=1)
-        certain = known(touching).astype(np.float64)
+        certain = is_known(touching).astype(np.float64)
         weights = np.concatenate([weight, certain], axis=1)
         cameras = refine_cameras(
             given=unit,

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
 from gsgan.scene import NEAR
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Float, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
@@ -97,7 +97,7 @@ def _robust(
     max_error: float,
 ) -> Triangulated:
     # A start that a few wrong detections do not spoil.
-    weight = np.where(known(uv), weight, 0.0)
+    weight = np.where(is_known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p = _best_pair(cameras, uv, weight, a, b)
 

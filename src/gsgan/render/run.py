@@ -59,7 +59,7 @@ def render_config(config: DictConfig) -> None:
 
     # The motion, and the camera of each frame.
     drive = smooth(config.smooth, drive_of(motion, run, fps), fps)
-    drive = _chosen(drive, config, fps)
+    drive = _choose(drive, config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
     record = {
@@ -120,7 +120,7 @@ def _output(config: DictConfig) -> Output:
     return Output(out, float(above("fps", config.fps)), bool(config.provenance))
 
 
-def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
+def _choose(drive: Drive, config: DictConfig, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
     # The first frame must exist.
     start = whole("start", config.start, 0)

@@ -56,7 +56,7 @@ OPTIONS = (
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
     # Images are undistorted when they are read, so the dataset knows that effect.
-    distortion = _effect_settings(config).requested("distortion")
+    distortion = _effect_settings(config).value_of("distortion")
     data: GsganData = instantiate(config.data, distortion=distortion)
     data.prepare_data()
     data.setup()
@@ -72,7 +72,7 @@ def moves_with_body(config: DictConfig) -> bool:
         or model.get("surface") is not None
     ):
         return True
-    on_body = _effect_settings(config).requested("body_points") != OFF
+    on_body = _effect_settings(config).value_of("body_points") != OFF
     return model.get("body_points") is not None and on_body
 
 

@@ -19,20 +19,20 @@ from gsgan.model.harmonic import distil
 from gsgan.motion.clip import (
     FPS,
     Clip,
-    checked,
-    completed,
+    complete,
     frame_times,
     is_own,
-    resampled,
+    mask_unseen,
+    resample,
     up_axis,
 )
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import (
-    expressed,
     face_in_head,
-    joined,
-    placed,
-    retargeted,
+    join,
+    place,
+    retarget,
+    transfer_face,
 )
 from gsgan.motion.smooth import OneEuro
 from gsgan.run.runs import Run
@@ -280,9 +280,9 @@ def _join(
         )
         parts.append(padded @ standard.T)
 
-    # Frames between two clips are made by `joined`.
+    # Frames between two clips are made by `join`.
     between = max(1, round(seconds * fps) - 1)
-    p = joined(parts, proportions, between) @ standard
+    p = join(parts, proportions, between) @ standard
 
     names = "; ".join(clip.text for clip in clips)
     return Drive(
@@ -325,7 +325,7 @@ def _from_file(
     body = None
     if own:
         nearest = np.rint(frame_times(len(motion), rate, fps)).astype(int)
-        p = resampled(motion.p, rate, fps)
+        p = resample(motion.p, rate, fps)
         visibility = motion.visibility[nearest]
         if motion.body is not None and run.avatar.needs_body:
             body = motion.body[torch.from_numpy(nearest)]
@@ -369,7 +369,9 @@ def _clip(options: MotionOptions, run: Run, path: Path) -> Clip:
         up=options.up,
         animation=None if animation is None else str(animation),
     )
-    motion = checked(read_motion(path, source), float(options.min_visibility))
+    motion = mask_unseen(
+        read_motion(path, source), float(options.min_visibility)
+    )
     _refuse_swapped(motion)
 
     # Joints that belong to no bones have to be retargeted.
@@ -400,12 +402,12 @@ def _on_subject(
     proportions = run.proportions
     standard = upright(proportions.up)
     centre = standard @ np.array(run.scene.centre)
-    p = completed(motion, up)
+    p = complete(motion, up)
     if p.shape[1] > FACE.start:
         p = p if motion.detached else face_in_head(p)
-        p[:, FACE] = expressed(p[:, FACE], run.face)
-    p = retargeted(resampled(p, rate, fps), proportions)
-    p = placed(
+        p[:, FACE] = transfer_face(p[:, FACE], run.face)
+    p = retarget(resample(p, rate, fps), proportions)
+    p = place(
         p,
         proportions,
         centre,

@@ -107,9 +107,9 @@ def sanitise(
         return p, valid
 
     # Estimated hips are used, but not marked as seen.
-    placed = valid | _estimated_hips(p, valid, template)
+    placed = valid | _find_hips(p, valid, template)
     _refuse_without_trunk(placed, template)
-    return _filled(p, placed, template, limb_length_sum), valid
+    return _fill(p, placed, template, limb_length_sum), valid
 
 
 def complete_skeleton(
@@ -148,9 +148,7 @@ def complete_skeleton(
     return p, valid * shown
 
 
-def _estimated_hips(
-    p: Tensor, valid: Tensor, template: SkeletonTemplate
-) -> Tensor:
+def _find_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
     """``[B, J]`` bool: estimated hips of skeletons that show both shoulders and no hip.
 
     Hips are estimates if they are finite and apart: zeros are none.
@@ -189,7 +187,7 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     )
 
 
-def _filled(
+def _fill(
     p: Tensor,
     valid: Tensor,
     template: SkeletonTemplate,

@@ -28,7 +28,7 @@ def composite(
     Source: paper Sec. 3.1, ``C = Σ c_i α_i Π_{j<i} (1 - α_j)``.
     """
     # Pixels are independent: chunks of them bound the memory.
-    front_to_back = _sorted(projected)
+    front_to_back = _sort(projected)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
         weights, left = _blend(
@@ -42,7 +42,7 @@ def composite(
     return image[:, : projected.features.shape[-1]], image[:, -1:]
 
 
-def _sorted(projected: Projected) -> Projected:
+def _sort(projected: Projected) -> Projected:
     """The ellipses of each batch item, front to back."""
     # Gaussians of equal depth keep their order.
     order = projected.depths.detach().argsort(dim=1, stable=True)

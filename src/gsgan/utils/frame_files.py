@@ -149,7 +149,7 @@ def entries(folder: Path) -> list[str]:
     return names
 
 
-def shifted_numbers(
+def find_shifts(
     images: Iterable[int], others: Mapping[str, Iterable[int]]
 ) -> list[str]:
     """Notes on files whose numbers are those of the images but for their start.

@@ -79,7 +79,7 @@ def png_bytes(image: Image.Image, marked: bool = True) -> bytes:
     return stream.getvalue()
 
 
-def marked_mp4(video: bytes) -> bytes:
+def mark_mp4(video: bytes) -> bytes:
     """An MP4 file with XMP that marks it as synthetic."""
     # A box: its size, its type, and its content. Readers skip types that they do not know.
     content = MP4_UUID + XMP.encode()

@@ -129,7 +129,7 @@ def _score(path: Path, name: str) -> float:
     return float(found)
 
 
-def unfinished(folder: Path) -> str | None:
+def why_unfinished(folder: Path) -> str | None:
     """Why the job in a folder is unfinished, or None."""
     # A job without a mark has ended well, or is none of a sweep.
     mark = folder / MARK

@@ -28,7 +28,7 @@ from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
-from gsgan.view.guard import guarded
+from gsgan.view.guard import guard_server
 from gsgan.view.session import IDLE_SECONDS, Session, Show
 
 MEGABYTE = 1 << 20
@@ -125,7 +125,10 @@ class Viewer:
         # The server without viser's own banner, and without its share button, which would put the
         # avatar on a public address.
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        with contextlib.redirect_stdout(io.StringIO()), guarded(host, origin):
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            guard_server(host, origin),
+        ):
             self.server = viser.ViserServer(
                 host, port, label="gsgan", verbose=False
             )

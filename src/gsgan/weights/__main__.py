@@ -15,7 +15,7 @@ def list_weights(config: DictConfig) -> None:
     from gsgan.utils.console import make_console
     from gsgan.utils.errors import DataError
     from gsgan.weights import files
-    from gsgan.weights.networks import pretrained
+    from gsgan.weights.networks import load_pretrained
 
     console = make_console()
     problems = []
@@ -32,7 +32,7 @@ def list_weights(config: DictConfig) -> None:
                 )
 
             # A wrong or damaged file is refused by the network.
-            pretrained(net, found.path)
+            load_pretrained(net, found.path)
         except DataError as error:
             problems.append(str(error))
             console.print(f"{title}: missing", highlight=False)

@@ -227,7 +227,7 @@ def _open(
 
     # A figure of an unfinished run says so.
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
-    total = run.planned(segmentation=avatar.segmentation is not None)
+    total = run.plan_length(segmentation=avatar.segmentation is not None)
     if step < total:
         marks = [
             *marks,
