@@ -15,6 +15,8 @@ from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.formats.consistency import Consistency
+from gsgan.evaluate.predictions import Prediction
+from gsgan.losses.photometric import photometric
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
@@ -197,3 +199,73 @@ def test_real_joints_lie_on_the_person_in_the_crop(real_capture):
             f"{item}: the crop cuts off {1 - kept:.2%} of the person"
         )
     assert hits / total > 0.9
+
+
+def cut_below(root: Path, height: int) -> None:
+    """Cuts every image, mask and label of a capture at this height."""
+    for path in root.rglob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), image[:height])
+
+    def shorten(rig: dict) -> None:
+        for camera in rig.values():
+            camera["size"][1] = height
+
+    edit_json(root / "cameras.json", shorten)
+
+
+def test_what_is_below_the_border_of_an_image_is_unknown(tmp_path):
+    root = write_tiny_capture(tmp_path / "whole", size=(48, 48), labels=True)
+    whole = every_frame(root, size=48)
+    cut_below(root, 26)
+    cut = every_frame(root, size=48)
+
+    # The window is padded below; the person goes on there.
+    for frame, complete in zip(cut, whole, strict=True):
+        unknown = frame.unsure[0, 0] > 0
+        rows = unknown.all(dim=1)
+        assert rows.any()
+        assert not unknown[~rows].any()
+        assert (frame.labels[0][unknown] == 255).all()
+        assert (frame.mask[0, 0][unknown] == 0).all()
+        assert complete.unsure is None
+
+    # A person that ends inside the image does not go on beyond its border.
+    for path in (root / "masks").rglob("*.png"):
+        mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        mask[-2:] = 0
+        cv2.imwrite(str(path), mask)
+    for frame in every_frame(root, size=48):
+        assert not frame.unsure.any()
+
+
+def test_losses_and_scores_ignore_what_is_below_the_border(tmp_path):
+    root = write_tiny_capture(tmp_path / "cut", size=(48, 48))
+    cut_below(root, 26)
+    (frame, *_) = every_frame(root, size=48)
+    below = frame.unsure > 0
+
+    # Two renderings that differ below the border alone.
+    image = torch.rand(
+        frame.image.shape, generator=torch.Generator().manual_seed(0)
+    )
+    other = torch.where(below, 1 - image, image)
+    losses = []
+    for one in (image, other):
+        one = one.clone().requires_grad_()
+        loss = photometric(
+            one, frame.image, l1=1.0, ssim=0.0, unsure=frame.unsure
+        )
+        loss.backward()
+        assert one.grad[below.expand_as(one.grad)].eq(0).all()
+        losses.append(float(loss.detach()))
+    assert losses[0] == losses[1]
+
+    # Predictions are cleared there, where the ground truth is black.
+    stored = (~below).float()
+    prediction = Prediction({"full": image}, {"full": torch.ones_like(stored)})
+    inside = prediction.inside(stored)
+    assert inside.images["full"][below.expand_as(image)].eq(0).all()
+    assert torch.equal(inside.alphas["full"], stored)
+    opaque = Prediction({"full": image}, {"full": None}).inside(stored)
+    assert torch.equal(opaque.images["full"], image)

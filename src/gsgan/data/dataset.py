@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,7 +66,8 @@ class CaptureDataset(Dataset[Frame]):
 
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
     undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
-    camera alone. Labels keep 255 as "ignore".
+    camera alone. Labels keep 255 as "ignore". Where the person's mask reaches the border of the
+    stored image, the person goes on beyond it: pixels beyond it are unsure, and their labels 255.
 
     Args:
         layout: the capture.
@@ -174,18 +176,35 @@ class CaptureDataset(Dataset[Frame]):
             unsure = fit(unsure, True)
         return mask, unsure
 
-    def inside(self, index: int) -> Tensor | None:
+    def inside(self, item: Item) -> Tensor | None:
         """``[1, 1, H, W]`` 1 at pixels of the item that lie in the stored image; None if all do.
 
         Windows reach beyond borders, and undistorted images have empty rims.
         """
-        item = self.items[index]
-        # A white image, cropped and resized like the item's: what stays white is inside.
-        white = np.full(self._entry(item).size, 255, np.uint8)
-        taken = self._fitting(item)(white, True)
+        taken = self._stored_pixels(item)
         return (
             None if taken.all() else unit(torch.from_numpy(taken))[None, None]
         )
+
+    @cached_property
+    def padded(self) -> bool:
+        """Whether the window of any item reaches beyond the stored image."""
+        for item in self.items:
+            window = self.window(item)
+            height, width = self._entry(item).size
+            bottom = window.top + window.size[0]
+            right = window.left + window.size[1]
+            if min(window.top, window.left) < 0:
+                return True
+            if bottom > height or right > width:
+                return True
+        return False
+
+    def _stored_pixels(self, item: Item) -> Bytes:
+        """``[H, W]`` 255 at pixels of the item that lie in the stored image, else 0."""
+        # A white image, cropped and resized like the item's: what stays white is inside.
+        white = np.full(self._entry(item).size, 255, np.uint8)
+        return self._fitting(item)(white, True)
 
     def _entry(self, item: Item) -> CameraEntry:
         """The calibrated camera of an item."""
@@ -255,7 +274,18 @@ class CaptureDataset(Dataset[Frame]):
         # stored outline.
         if unsure is not None:
             unsure = fit(unsure, True)
+        goes_on = touches_border(mask)
         mask = fit(mask, rules.mask_sampling == "nearest")
+
+        # What no pixel shows of a person who goes on beyond the border is unknown. All items of a
+        # dataset have unsure pixels, or none, so that they form batches.
+        if self.padded:
+            beyond = np.zeros_like(mask)
+            if goes_on:
+                beyond = 255 - self._stored_pixels(item)
+            unsure = beyond if unsure is None else np.maximum(unsure, beyond)
+            if labels is not None:
+                labels[beyond > 0] = IGNORE_LABEL
 
         # Channels first, as networks take them.
         chw = np.ascontiguousarray(image.transpose(2, 0, 1))
@@ -318,6 +348,12 @@ class CaptureDataset(Dataset[Frame]):
         labels = pixels.read_labels(path, self.layout.pixels, names)
         self._check_size(path, labels, camera)
         return labels
+
+
+def touches_border(mask: Bytes) -> bool:
+    """Whether a mask ``[H, W]`` 0..255 reaches the border of its image."""
+    edges = (mask[0], mask[-1], mask[:, 0], mask[:, -1])
+    return any(bool((edge >= 128).any()) for edge in edges)
 
 
 def _float(array: NDArray[np.float64]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,6 +67,21 @@ class Prediction:
     segmentation: Tensor | None = None
     labels: Tensor | None = None
     no_parts: str = "predictions are images, not a segmentation"
+
+    def inside(self, stored: Tensor) -> Prediction:
+        """The prediction with nothing beyond the stored image, where there is no ground truth.
+
+        Args:
+            stored: ``[1, 1, H, W]`` 1 at pixels of the stored image, else 0.
+        """
+        # Opaque images show the background there, whatever its colour.
+        images = dict(self.images)
+        alphas = dict(self.alphas)
+        for name, alpha in self.alphas.items():
+            if alpha is not None:
+                images[name] = images[name] * stored
+                alphas[name] = alpha * stored
+        return replace(self, images=images, alphas=alphas)
 
 
 class BodyBoxes:

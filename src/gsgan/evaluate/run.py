@@ -20,7 +20,7 @@ from rich.console import Console
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.data.splits import VALIDATION, spread_items
+from gsgan.data.splits import VALIDATION, Item, spread_items
 from gsgan.evaluate.align import PoseAlignment
 from gsgan.evaluate.distance import write_distances
 from gsgan.evaluate.files import (
@@ -35,7 +35,12 @@ from gsgan.evaluate.files import (
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
 from gsgan.evaluate.origin import Method, fingerprint, origin, read_method
-from gsgan.evaluate.predictions import BodyBoxes, Preparation, read_folder
+from gsgan.evaluate.predictions import (
+    BodyBoxes,
+    Prediction,
+    Preparation,
+    read_folder,
+)
 from gsgan.evaluate.scores import (
     Predict,
     Scorer,
@@ -57,6 +62,7 @@ from gsgan.run.stored import (
     read_checkpoint,
     read_config,
 )
+from gsgan.scene import Frame
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
@@ -462,6 +468,16 @@ def _score(
     if kept is not None:
         kept.restore(tally)
 
+    # Nothing is compared beyond the stored images.
+    def predict_inside(frame: Frame, item: Item) -> Prediction:
+        prediction = predict(frame, item)
+        stored = dataset.inside(item) if dataset.padded else None
+        return (
+            prediction
+            if stored is None
+            else prediction.inside(stored.to(device))
+        )
+
     # Flicker compares with the frame before, which must be rendered again.
     done = tally.images
     if done:
@@ -470,13 +486,13 @@ def _score(
         )
         before = dataset.items[places[done - 1]]
         frame = dataset[places[done - 1]].to(device)
-        tally.look_at(before, frame, predict(frame, before))
+        tally.look_at(before, frame, predict_inside(frame, before))
 
     # The remaining images, with the scores so far kept from time to time.
     order = track(places[done:], title, console)
     return score_split(
         ((dataset.items[place], dataset[place].to(device)) for place in order),
-        predict,
+        predict_inside,
         scorer,
         shown=evenly_spaced(len(places), grid_rows),
         tally=tally,

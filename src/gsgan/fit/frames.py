@@ -135,7 +135,7 @@ class MaskedFrames:
         """
         # The mask's own unsure pixels.
         mask, unsure = self.dataset.mask(place)
-        inside = self.dataset.inside(place)
+        inside = self.dataset.inside(self.dataset.items[place])
         if inside is not None:
             outside = np.where(inside[0, 0].numpy() < 0.5, 255, 0).astype(
                 np.uint8

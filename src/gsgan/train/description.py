@@ -26,8 +26,16 @@ def describe(
     module: AvatarTraining,
     device: torch.device,
     precision: str,
+    hours: float | None,
 ) -> None:
-    """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
+    """Prints the data, the parts with their sizes, the effects and the stand-ins in use.
+
+    Args:
+        console, folder: where it is printed, and the run's folder.
+        data, module: of the run.
+        device, precision: of the training.
+        hours: that training is expected to take; None: unknown.
+    """
     # The data, the parts and what they learn from, then how they are trained.
     table = Table(title=f"gsgan: {folder}", show_header=False)
     schedule = module.schedule
@@ -44,6 +52,8 @@ def describe(
             f"Step II {schedule.step_two}",
         ),
     ]
+    if hours is not None:
+        rows.append(("time", f"{_duration(hours)} of training on this CPU"))
     for name, text in rows:
         table.add_row(name, text)
     console.print(table)
@@ -52,6 +62,13 @@ def describe(
     for mark in module.marks:
         console.print(f"stand-in in use: {mark}", highlight=False)
     console.print(module.avatar.effects.table())
+
+
+def _duration(hours: float) -> str:
+    """Hours as text, rounded: an estimate."""
+    if hours < 1.5:
+        return f"about {max(60 * hours, 1):.0f} minutes"
+    return f"about {hours:.0f} hours"
 
 
 def _data(data: GsganData) -> list[Row]:

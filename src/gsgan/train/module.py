@@ -42,6 +42,8 @@ from gsgan.utils.tensors import full_precision
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
 T = TypeVar("T")
+# An iteration takes this many times as long as a rendering and its gradient: losses and optimisers.
+ITERATION_PER_GRADIENT = 1.4
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -217,6 +219,33 @@ class AvatarTraining(LightningModule):
         self._began = None
 
     # -- one iteration
+
+    def expected_hours(self, frame: Frame) -> float:
+        """Hours that a whole training would take on this device, about.
+
+        A rendering of each step and its gradient are measured after a warm-up; nothing is trained.
+        """
+        frame = self._cut(frame)
+        schedule = self.schedule
+        seconds = 0.0
+        for generate, iterations in (
+            (False, schedule.segmentation + schedule.step_one),
+            (True, schedule.step_two),
+        ):
+            # Models without splats, and without a generator, have one step.
+            if iterations == 0 or (self.avatar.splats is None and not generate):
+                continue
+            for _ in range(2):
+                began = time.perf_counter()
+                rendering = self.avatar(
+                    *frame.inputs, generate=generate, reach=self.window_reach
+                )
+                image = rendering.image if generate else rendering.colour
+                image.square().mean().backward()
+                once = time.perf_counter() - began
+            seconds += once * ITERATION_PER_GRADIENT * iterations
+        self.avatar.zero_grad(set_to_none=True)
+        return seconds / 3600
 
     def training_step(self, frame: Frame, batch_idx: int) -> None:
         if self.step >= self.schedule.total:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from signal import SIGTERM
@@ -62,9 +61,6 @@ from gsgan.utils.console import make_console, working
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.sweeps import STOPPED
 
-# A training iteration takes this many times as long as rendering: arithmetic of the networks at
-# 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
-STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 MAX_STORED_POSES = 100  # at most, whose spread is stored: all are posed at once
 
@@ -153,13 +149,11 @@ def run_training(config: DictConfig) -> None:
             return
 
     # What remains is checked, recorded and printed before the work begins.
-    refuse_long_cpu_run(
-        options.max_cpu_hours, data, module, module.schedule.total - done
-    )
-    module.code = training_code()
     device = device_of(config.trainer)
+    hours = _expected_hours(options.max_cpu_hours, data, module, done, device)
+    module.code = training_code()
     precision = str(config.trainer.precision)
-    describe(console, folder, data, module, device, precision)
+    describe(console, folder, data, module, device, precision, hours)
 
     # Training.
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -429,29 +423,27 @@ def _evaluate(
     )
 
 
-def refuse_long_cpu_run(
+def _expected_hours(
     max_hours: float | None,
     data: GsganData,
     module: AvatarTraining,
-    iterations: int,
-) -> None:
-    """Refuses a run of more hours on a CPU, which ``trainer=auto`` chose as it found no GPU."""
-    if max_hours is None:
-        return
+    done: int,
+    device: torch.device,
+) -> float | None:
+    """Hours that the iterations after those ``done`` take; None on a GPU, which is not measured.
 
-    # The time of one rendering, measured after a warm-up.
-    frame = data.dataset("train")[0]
-    with torch.no_grad():
-        module.avatar(*frame.inputs)
-        began = time.perf_counter()
-        module.avatar(*frame.inputs)
-        seconds = time.perf_counter() - began
-
-    # The estimate for the whole run, against the limit of the config.
-    hours = STEP_PER_RENDERING * seconds * iterations / 3600
-    if hours > max_hours:
+    Raises:
+        ConfigError: on more hours than ``max_hours``, where ``trainer=auto`` found no GPU.
+    """
+    if device.type != "cpu":
+        return None
+    iterations = module.schedule.total - done
+    hours = module.expected_hours(data.dataset("train")[0])
+    hours *= iterations / module.schedule.total
+    if max_hours is not None and hours > max_hours:
         raise ConfigError(
             f"no GPU is found, and on this CPU {iterations:,} iterations would take about "
             f"{hours:.0f} hours: size=small training=demo (without experiment= and protocol=) "
             "trains for minutes at 128², trainer=cpu starts this run anyway"
         )
+    return hours
