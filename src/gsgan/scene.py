@@ -530,11 +530,11 @@ def fold_radius(dist: Tensor) -> Tensor:
     """
     if dist.requires_grad or torch.compiler.is_compiling():
         return _fold_radius(dist)
-    if (found := _folds.get(dist)) is None:
+    if (radius := _folds.get(dist)) is None:
         # else of no use in training later
         with torch.inference_mode(False), torch.no_grad():
-            found = _folds[dist] = _fold_radius(dist)
-    return found
+            radius = _folds[dist] = _fold_radius(dist)
+    return radius
 
 
 _folds: WeakTensorKeyDictionary = WeakTensorKeyDictionary()

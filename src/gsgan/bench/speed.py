@@ -365,7 +365,7 @@ def settings_of(
         window = avatar.window(frame.skeleton, frame.camera)
         rows, columns = (height, width) if window is None else window.size
         pixels += rows * columns
-    found: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "image": f"{width} x {height}",
         "painted": f"{pixels / (len(frames) * height * width):.0%} of its pixels",
         "precision": config.precision,
@@ -379,16 +379,16 @@ def settings_of(
     # Settings of avatars with Gaussians.
     if avatar.splats is not None:
         backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
-        found |= {"accuracy": avatar.accuracy.name, "backend": backend}
-        found["channels of F"] = avatar.splat_channels
-        found["supersampling of F"] = avatar.accuracy.supersample
-        found["SH degree"] = avatar.splats.sh_degree
+        settings |= {"accuracy": avatar.accuracy.name, "backend": backend}
+        settings["channels of F"] = avatar.splat_channels
+        settings["supersampling of F"] = avatar.accuracy.supersample
+        settings["SH degree"] = avatar.splats.sh_degree
 
     # The number of Gaussians, on the body or on the skeleton.
     placed = avatar.body_points or avatar.densify
     if placed is not None:
-        found["Gaussians"] = placed.n_points
-    return found
+        settings["Gaussians"] = placed.n_points
+    return settings
 
 
 def text(

@@ -289,10 +289,10 @@ def _rig(
     ordered = sorted(turns, key=lambda turn: depth[turn.joint])
 
     # The numbers in the order of the turns, with the root's translation after its rotation.
-    found = list(
+    axis_names = list(
         dict.fromkeys(chain.from_iterable(turn.axes for turn in ordered))
     )
-    names = (*found[:3], *(f"transl_{k}" for k in XYZ), *found[3:])
+    names = (*axis_names[:3], *(f"transl_{k}" for k in XYZ), *axis_names[3:])
 
     # A joint without a turn moves with the last turn of the nearest joint above it.
     last = {turn.joint: i for i, turn in enumerate(ordered)}

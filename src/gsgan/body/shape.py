@@ -80,17 +80,17 @@ class BodyShape:
 
     def __post_init__(self) -> None:
         # A tensor that is None has the expected shape.
-        found = []
+        faults = []
         for name, shape in SHAPES.items():
             value = getattr(self, name)
-            found.append(list(shape if value is None else value.shape))
-        if self.coefficients.ndim != 1 or found != list(
+            faults.append(list(shape if value is None else value.shape))
+        if self.coefficients.ndim != 1 or faults != list(
             map(list, SHAPES.values())
         ):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
                 f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
-                f"{', '.join(map(str, [list(self.coefficients.shape), *found]))}"
+                f"{', '.join(map(str, [list(self.coefficients.shape), *faults]))}"
             )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:

@@ -134,13 +134,13 @@ def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
     broken = [
         j for j, parent in enumerate(parents) if j and not 0 <= parent < j
     ]
-    found = f"no earlier parent for joint {broken[0]}" if broken else None
+    problem = f"no earlier parent for joint {broken[0]}" if broken else None
     if len(column) != table.shape[1] or len(column) < 2:
-        found = f"{len(column)} joints in {table.shape[1]} columns"
-    if found:
+        problem = f"{len(column)} joints in {table.shape[1]} columns"
+    if problem:
         raise DataError(
             f"{path}: 'kintree_table' must name every joint once, its parent before it; "
-            f"found {found}"
+            f"found {problem}"
         )
     return tuple(parents)
 

@@ -221,7 +221,7 @@ class Solver(nn.Module):
         p = p - shift
 
         # Hands: their fingers, and the landmarks of the palm if they place the hand.
-        found = None
+        fingers = None
         hands = skeleton[:, BODY:WITH_HAND_JOINTS]
         if self.fingers is not None and hands.shape[1]:
             seen = (
@@ -230,19 +230,19 @@ class Solver(nn.Module):
 
             # The finger solver says which hands can be placed, and where.
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
-            found = self.fingers(near, seen)
+            fingers = self.fingers(near, seen)
 
             # Of a placed hand, the landmarks of the palm count instead of the
             # three of the 33.
-            replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
-            placed = found.placed.repeat_interleave(len(PALM), dim=1)
+            replaced = (fingers.placed.unsqueeze(-1) & self.replaced).any(1)
+            placed = fingers.placed.repeat_interleave(len(PALM), dim=1)
             held = placed.to(weight) / LANDMARK_NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
 
             # They are the body's own palm where the hand was placed, so that
             # their errors agree.
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
-            at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
+            at = own @ fingers.rotations.mT + fingers.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
 
         # Frame by frame, in chunks.
@@ -259,10 +259,10 @@ class Solver(nn.Module):
         transl = torch.cat(transls)
 
         # Fingers that are shown replace those at rest.
-        if self.fingers is not None and found is not None:
+        if self.fingers is not None and fingers is not None:
             joints = self.fingers.joints
-            shown = found.shown.unsqueeze(-1)
-            turns = torch.where(shown, found.turns, theta[:, joints])
+            shown = fingers.shown.unsqueeze(-1)
+            turns = torch.where(shown, fingers.turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
@@ -688,11 +688,11 @@ def _jumps(parent: Tensor) -> Tensor:
     # Twice as far each time, until every turn arrives at the identity.
     T = len(parent)
     jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
-    found = []
+    jumps = []
     while bool((jump < T).any()):
-        found.append(jump)
+        jumps.append(jump)
         jump = jump[jump]
-    return torch.stack(found)
+    return torch.stack(jumps)
 
 
 def _solve_spd(H: Tensor, g: Tensor) -> Tensor:

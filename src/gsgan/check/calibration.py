@@ -188,7 +188,7 @@ def calibration_findings(
     named: Iterable[str] = (),
 ) -> list[Finding]:
     """Findings on wrong cameras and the usual causes; other findings name ``named`` already."""
-    found = list[Finding]()
+    findings = list[Finding]()
     named = set(named)
 
     # Masks far larger than the body: one finding for all of them, which then do not count.
@@ -204,7 +204,7 @@ def calibration_findings(
             "length that is too short, K of smaller images, a skeleton in another unit, or "
             "masks of more"
         )
-        found.append(Finding("error", TOPIC, text))
+        findings.append(Finding("error", TOPIC, text))
         scores = [score for score in scores if score not in big]
 
     # Pairs that fit better with each other's calibration.
@@ -219,7 +219,7 @@ def calibration_findings(
                 f"{other.rivals[one.name]:.2f}, its own {one.overlap:.2f} and {other.overlap:.2f});"
                 " exchange them in the calibration, or rename the folders"
             )
-            found.append(Finding("error", TOPIC, text))
+            findings.append(Finding("error", TOPIC, text))
             named.update((one.name, other.name))
 
     # All cameras are off, so no single one is the cause.
@@ -243,10 +243,10 @@ def calibration_findings(
             continue
         finding = _of_one(score, scores, limits, min_inside)
         if finding:
-            found.append(finding)
+            findings.append(finding)
         else:
             fine.append(score)
-    return found + small_errors(fine, limits)
+    return findings + small_errors(fine, limits)
 
 
 def mask_findings(
@@ -261,11 +261,11 @@ def mask_findings(
         return [Finding("error", TOPIC, text)]
 
     # White everywhere, or inverted.
-    found = []
+    findings = []
     full = [score.name for score in scores if score.filled > FULL]
     if full:
         text = f"masks are white everywhere ({list_names(full)}); {wrong}"
-        found.append(Finding("error", TOPIC, text))
+        findings.append(Finding("error", TOPIC, text))
     inverted = []
     for score in scores:
         limit = max(score.overlap + limits.better_fit, CREDIBLE_OVERLAP)
@@ -278,7 +278,7 @@ def mask_findings(
             f"the inverted masks would fit (overlap: {list_names(inverted)}): the person must be "
             "white and the background black; invert them"
         )
-        found.append(Finding("error", TOPIC, text))
+        findings.append(Finding("error", TOPIC, text))
 
     # A second body.
     several = []
@@ -291,8 +291,8 @@ def mask_findings(
             f"{list_names(several)}): another person, whom training would learn as well; remove it "
             "from the masks"
         )
-        found.append(Finding("warning", TOPIC, text))
-    return found
+        findings.append(Finding("warning", TOPIC, text))
+    return findings
 
 
 def _are_exchanged(
@@ -367,7 +367,7 @@ def small_errors(
         return [Finding("warning", TOPIC, text)]
 
     # One camera is off much more than the others.
-    found = []
+    findings = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
         others = float(np.median(rest)) if rest else np.inf
@@ -376,5 +376,5 @@ def small_errors(
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
                 f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly off"
             )
-            found.append(Finding("warning", TOPIC, text))
-    return found
+            findings.append(Finding("warning", TOPIC, text))
+    return findings

@@ -61,7 +61,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     p = subject.seen_p
     template = subject.template
     names = template.names
-    found = list[Doubt]()
+    doubts = list[Doubt]()
 
     # Each kind of doubt is a table of flags by frame and joint.
     def doubt(
@@ -77,7 +77,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
             for place in np.flatnonzero(flags[row]).tolist():
                 texts.append(text(row, place))
             frame = int(subject.frames[row])
-            found.append(Doubt(frame, kind, f"{what}{list_names(texts, 3)}"))
+            doubts.append(Doubt(frame, kind, f"{what}{list_names(texts, 3)}"))
 
     # Jumps, unless neighbours in the list are not neighbours in time.
     jump = jump_distance(p)
@@ -128,7 +128,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
         pixels > limits.reprojection * float(focal),
         lambda row, joint: text.format(names[joint], pixels[row, joint]),
     )
-    return found
+    return doubts
 
 
 def find_exchanges(subject: CheckedData) -> Bool:

@@ -127,17 +127,17 @@ def _hands_and_face(
     frame: int,
 ) -> list[tuple[Float, tuple[int, int, int]]]:
     """The visible landmarks ``[N, 3]`` of left hand, right hand and face, with their colours."""
-    found = []
+    landmarks = []
     hands = subject.layout.hands
     face = subject.layout.face
     if hands is not None and frame in hands.p:
         p = hands.p[frame]
         seen = hands.visibility[frame] > 0
-        found.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
-        found.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
+        landmarks.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
+        landmarks.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
     if face is not None and frame in face.p:
-        found.append((face.visible_joints(frame), MIDDLE_COLOUR))
-    return found
+        landmarks.append((face.visible_joints(frame), MIDDLE_COLOUR))
+    return landmarks
 
 
 def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:

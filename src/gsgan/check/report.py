@@ -114,12 +114,12 @@ class CheckReport:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, errors first."""
-        found: list[Finding] = []
+        collected: list[Finding] = []
         for section in self.sections:
-            found += section.findings
+            collected += section.findings
         # Sorting keeps the order of the sections within each level.
         return tuple(
-            sorted(found, key=lambda finding: finding.level != "error")
+            sorted(collected, key=lambda finding: finding.level != "error")
         )
 
     @property

@@ -93,21 +93,25 @@ def geometry_findings(
     subject: CheckedData, geometry: Geometry
 ) -> list[Finding]:
     """Findings on implausible units, a camera in another unit, and an up axis that is not up."""
-    found = [Finding("error", "units", text) for text in geometry.far.values()]
+    findings = [
+        Finding("error", "units", text) for text in geometry.far.values()
+    ]
 
     # A height that is impossible, or only unlikely.
     stature = geometry.stature
     if not PLAUSIBLE[0] <= stature <= PLAUSIBLE[1]:
         text = f"limb lengths suggest a person of {stature:.3g} m; check unit and joint order"
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
-        found.append(Finding("warning" if possible else "error", "units", text))
+        findings.append(
+            Finding("warning" if possible else "error", "units", text)
+        )
 
     if geometry.lean > MAX_LEAN:
         way = axis_name(geometry.up)
         axis = subject.layout.meta.up_axis
         text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
-        found.append(Finding("warning", "units", text))
-    return found
+        findings.append(Finding("warning", "units", text))
+    return findings
 
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
@@ -273,7 +277,7 @@ def sections(m: Measurements) -> Sequence[Section]:
         geometry_table(m.subject, m.geometry),
         lens_table(m.subject, m.geometry),
     )
-    found = geometry_findings(m.subject, m.geometry)
+    findings = geometry_findings(m.subject, m.geometry)
 
     # One strip of images per camera.
     strips = []
@@ -283,7 +287,7 @@ def sections(m: Measurements) -> Sequence[Section]:
         strips.append(Figure(f"camera {name}", image))
     return (
         _contents(m),
-        Section("Units and cameras", units, found),
+        Section("Units and cameras", units, findings),
         _agreement(m),
         Section("Overlays", figures=strips, text=overlays.LEGEND),
         _frames(m),
@@ -335,17 +339,17 @@ def _contents(m: Measurements) -> Section:
         contents.append(("note of the reader", note))
 
     # Damaged and missing images.
-    found = [*m.broken, *_doubtful_notes(layout.notes)]
+    findings = [*m.broken, *_doubtful_notes(layout.notes)]
     for name, files in subject.pairs.items():
         lacking = sorted(set(frames) - set(files))
         if lacking:
             # Long lists of numbers are shortened to ranges.
             text = f"{len(lacking)} of the {len(frames)} frames: {format_ranges(lacking)}"
-            found.append(
+            findings.append(
                 Finding("warning", "files", f"camera {name} lacks {text}")
             )
     table = Table(("what", "how much"), contents)
-    return Section("Contents", (table,), found)
+    return Section("Contents", (table,), findings)
 
 
 def _doubtful_notes(notes: Iterable[str]) -> Iterator[Finding]:
@@ -408,15 +412,15 @@ def _agreement(m: Measurements) -> Section:
 
     # Findings by the thresholds that the reader of the data uses too.
     min_inside = m.subject.consistency.min_inside
-    found = mask_findings(m.cameras, m.limits)
-    if not any(finding.level == "error" for finding in found):
-        found += calibration_findings(
+    findings = mask_findings(m.cameras, m.limits)
+    if not any(finding.level == "error" for finding in findings):
+        findings += calibration_findings(
             m.cameras, m.limits, min_inside, m.geometry.far
         )
     return Section(
         "Skeleton, masks and cameras",
         (table,),
-        found,
+        findings,
         text=AGREEMENT,
     )
 

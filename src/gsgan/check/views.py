@@ -201,15 +201,15 @@ def sample_items(subject: CheckedData, images: int) -> list[Item]:
 def cut_items(subject: CheckedData, maximum: int) -> list[Item]:
     """At most ``maximum`` items with an image or mask file that was cut off; none is decoded."""
     layout = subject.layout
-    found: list[Item] = []
+    items: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
-            if len(found) == maximum:
-                return found
+            if len(items) == maximum:
+                return items
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):
-                found.append((name, frame))
-    return found
+                items.append((name, frame))
+    return items
 
 
 def measure(
@@ -230,12 +230,12 @@ def measure(
     unique = tuple(dict.fromkeys(items))
     bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
-        found = bar.track(
+        measured = bar.track(
             pool.map(one, unique),
             len(unique),
             description="checking images",
         )
-        results = list(found)
+        results = list(measured)
 
     # Images that cannot be read are findings.
     views = []

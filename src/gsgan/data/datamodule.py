@@ -403,10 +403,10 @@ class GsganData(LightningDataModule):
         for split in SPLITS[1:]:
             tested += self.splits.items[split].cameras
         train = self.dataset("train")
-        found = scene_info(
+        scene = scene_info(
             self.layout, self.splits, train, self.info_samples, tested
         )
-        return replace(found, face=self.face)
+        return replace(scene, face=self.face)
 
     @property
     def eval_names(self) -> tuple[str, ...]:

@@ -289,15 +289,15 @@ def _texture(dataset: CaptureDataset, samples: int) -> float:
     """The mean texture of the person's pixels."""
     # Pixels nearer to the outline than this see it in their windows.
     kernel = np.ones((SIDE + 2, SIDE + 2), np.uint8)
-    found = [np.zeros(0)]
+    textures = [np.zeros(0)]
     for indices in _sample(dataset, samples):
         for index in indices:
             frame = dataset[index]
             solid = (frame.mask[0, 0] > SOLID).numpy().astype(np.uint8)
             inside = cv2.erode(solid, kernel, borderValue=0) > 0
             levels = grey(frame.image[0].permute(1, 2, 0).numpy())
-            found.append(texture(levels)[inside])
-    pixels = np.concatenate(found)
+            textures.append(texture(levels)[inside])
+    pixels = np.concatenate(textures)
     return float(pixels.mean()) if pixels.size else 0.0
 
 

@@ -174,11 +174,11 @@ def decide(
     # Two effects depend on whether Gaussians are on a body; all others decide by themselves.
     model = model or ModelParts()
     on_body = _one("body_points", info, settings, model)
-    found = {
+    effects = {
         name: _one(name, info, settings, model, on_body) for name in CHOICES
     }
-    cameras = info.train_cameras if found["colour_correction"].on else ()
-    return Effects(**found, cameras=cameras)
+    cameras = info.train_cameras if effects["colour_correction"].on else ()
+    return Effects(**effects, cameras=cameras)
 
 
 def _one(

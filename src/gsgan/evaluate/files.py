@@ -131,28 +131,28 @@ def rows(
 def notes(results: Results) -> list[str]:
     """Every reason and mark of the table, once each."""
     # Keys of a dictionary: each note once, in the order of the table.
-    found: dict[str, None] = {}
+    lines: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants[FULL]
-        found |= dict.fromkeys(_spread_notes(scores))
+        lines |= dict.fromkeys(_spread_notes(scores))
 
         # The inputs of the metrics, and marks.
         described = scores.get("lpips_input")
         if described:
-            found[f"LPIPS' networks get {described}"] = None
+            lines[f"LPIPS' networks get {described}"] = None
         boxes = scores.get("boxes")
         if boxes:
-            found[f"boxes: {boxes}"] = None
+            lines[f"boxes: {boxes}"] = None
         for mark in scores["marks"]:
-            found[f"marked: {mark}"] = None
+            lines[f"marked: {mark}"] = None
 
         # The protocol is the same for every split, and so is its note.
         if scores.get("protocol"):
-            found |= dict.fromkeys(_protocol_notes(scores["protocol"]))
+            lines |= dict.fromkeys(_protocol_notes(scores["protocol"]))
 
         # Why there is no score, by reason.
         if not scores["images"]:
-            found[f"{split}: {scores['psnr_reason']}"] = None
+            lines[f"{split}: {scores['psnr_reason']}"] = None
             continue
 
         # Metrics that lack for the same reason share a note.
@@ -163,8 +163,8 @@ def notes(results: Results) -> list[str]:
                     metric
                 )
         for reason, metrics in missing.items():
-            found[f"{', '.join(metrics)} n/a: {reason}"] = None
-    return list(found)
+            lines[f"{', '.join(metrics)} n/a: {reason}"] = None
+    return list(lines)
 
 
 def _spread_notes(scores: Mapping[str, Any]) -> list[str]:

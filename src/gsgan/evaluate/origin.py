@@ -136,8 +136,8 @@ def _commit() -> tuple[str | None, bool | None]:
         return None, None
 
     # The description ends with the mark of local changes.
-    found = done.stdout.strip()
-    return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
+    commit = done.stdout.strip()
+    return commit.removesuffix(DIRTY) or None, commit.endswith(DIRTY)
 
 
 def caption(origin: dict[str, Any]) -> str:

@@ -90,10 +90,10 @@ class BodyBoxes:
 
     def __init__(self, data: GsganData) -> None:
         # A capture may have poses without a body, and the reverse.
-        found = data.layout.meta.body
+        meta = data.layout.meta.body
         self.body: SkinnedBody | None = None
-        if data.layout.poses is not None and found is not None:
-            self.body = open_body(found.kind, found.file, found.betas)
+        if data.layout.poses is not None and meta is not None:
+            self.body = open_body(meta.kind, meta.file, meta.betas)
 
     @property
     def departures(self) -> list[str]:
@@ -313,19 +313,19 @@ def read_folder(
             # Numbers are compared without their zeros: programs pad them
             # differently.
             name = _fill_fields(pattern, values)
-            found = stored.get(_strip_zeros(name), [])
-            if not found:
+            paths = stored.get(_strip_zeros(name), [])
+            if not paths:
                 missing.append(f"{what}, expected as {name}")
                 continue
-            if len(found) > 1:
+            if len(paths) > 1:
                 raise DataError(
-                    f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
+                    f"{root} has {what} twice, as {paths[0]} and {paths[1]}; keep one of them"
                 )
 
             # It must have the size of the ground truth.
-            files[camera, frame] = found[0]
+            files[camera, frame] = paths[0]
             truth = f"the ground truth of {what}, as scored,"
-            check_image(root / found[0], "image", size, truth)
+            check_image(root / paths[0], "image", size, truth)
 
     # The number of missing images, and the first of them.
     if missing:

@@ -336,19 +336,19 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
 
     # The method of the scores that the folder holds already.
     held = out / FACTS_FILE
-    found = method
+    stored = method
     if held.is_file():
         try:
-            found = json.loads(held.read_text())["method"]
+            stored = json.loads(held.read_text())["method"]
         except (ValueError, KeyError, TypeError):
             raise ConfigError(
                 f"{held} is damaged; choose another folder with out="
             ) from None
 
     # Scores of the same method are replaced.
-    if found != method:
+    if stored != method:
         raise ConfigError(
-            f"out={out} holds scores of {found}, not of {method}; choose another folder"
+            f"out={out} holds scores of {stored}, not of {method}; choose another folder"
         )
     return out
 
@@ -419,9 +419,9 @@ def evaluate_method(
         )
 
     # Only now, as everything is scored, files are written.
-    for split, found in scores.items():
-        if found.grid:
-            write_grid(found.grid, folder / "grids" / f"{split}.png")
+    for split, split_scores in scores.items():
+        if split_scores.grid:
+            write_grid(split_scores.grid, folder / "grids" / f"{split}.png")
     joined = _join_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
     if poses is not None and not joined.rows.empty:
@@ -514,15 +514,15 @@ def _join_splits(
     # metrics.json by split, scores.csv by image.
     results: Results = {}
     rows = []
-    for split, found in scores.items():
-        held = found.variants
+    for split, split_scores in scores.items():
+        held = split_scores.variants
         if not held:
             reason = data.reasons.get(split, "no frames")
             held = {name: empty(reason, scorer) for name in variants}
         results[split] = {}
         for name, values in held.items():
             results[split][name] = values | {"protocol": scorer.protocol}
-        for variant, of_variant in found.rows.items():
+        for variant, of_variant in split_scores.rows.items():
             for row in of_variant:
                 rows.append({"split": split, "variant": variant, **row})
     return Scored(results, pd.DataFrame(rows, columns=HEADER), origin)

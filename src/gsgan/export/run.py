@@ -87,14 +87,14 @@ def export_config(config: DictConfig) -> None:
     # With `verify` nothing is exported: a file is read for its marks.
     if config.verify is not None:
         path = Path(config.verify).expanduser()
-        found = verify(path)
+        problem = verify(path)
         state = (
             "marked as synthetic"
-            if found.synthetic
+            if problem.synthetic
             else "not marked as synthetic"
         )
         tell(f"{path.name}: {state}")
-        tell(found.summary())
+        tell(problem.summary())
         return
 
     # Options are checked before the run is loaded. Programs are made on the CPU, so

@@ -133,7 +133,7 @@ def fit_hands(
     fingers = Fingers(body)
     beyond = seen.clone()
     beyond[:, wrists] = False
-    found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
+    fingers_found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
 
     # The wrist landmark at rest, as it moves with the forearm and as it moves with the hand: the
     # wrist joint goes to the former, and the hand moves by the difference.
@@ -141,7 +141,9 @@ def fit_hands(
     on_arm = _at_rest(
         forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists]
     )
-    in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
+    in_hand = _at_rest(
+        fingers_found.rotations, fingers_found.shifts, hands[:, wrists]
+    )
 
     # The medians over frames that show the hand with its forearm.
     usable = fingers.has_palms(seen) & (visibility[:, FOREARMS] > 0).all(-1)

@@ -501,10 +501,10 @@ class BodyPoints(nn.Module):
         learnt = self.points.learnt
         if self.offsets is None or learnt is None:
             return None
-        found: Tensor = self.offsets(
+        offsets: Tensor = self.offsets(
             pose.theta, learnt.interpolate, pose.offsets
         )
-        return found
+        return offsets
 
     def _skin(
         self, bones: Tensor, terms: tuple[Tensor, Tensor] | None

@@ -313,8 +313,8 @@ class Deformation(ResidualGaussians):
 
         def make() -> Tensor:
             # The place at rest and the learned numbers of the point.
-            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
-            return found
+            features: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            return features
 
         return derive(
             self,
@@ -428,12 +428,12 @@ class _Trunk(torch.autograd.Function):
 
         # The gradient at the last layer's output, before its ReLU.
         g = through(grad.reshape(B * N, -1), outputs[-1], 0)
-        found: list[Tensor | None] = []
+        gradients: list[Tensor | None] = []
 
         # From the last layer to the second: gradients of weight and bias, then of the layer's
         # input.
         for w, x in zip(reversed(weights), reversed(outputs[:-1]), strict=True):
-            found = [g.mT @ x, g.sum(0), *found]
+            gradients = [g.mT @ x, g.sum(0), *gradients]
             g = g @ w
             through.grad_input(g, x, 0, grad_input=g)
 
@@ -444,5 +444,5 @@ class _Trunk(torch.autograd.Function):
             d_learned.view(B, N, learned),
             g.mT @ inputs,
             g.view(B, N, -1).sum(1),
-            *found,
+            *gradients,
         )

@@ -77,5 +77,5 @@ class PoseOffsets(nn.Module):
 
         # The offsets of all poses at once: the table has a row for each control.
         table = offsets.transpose(0, 1).flatten(1)
-        found = interpolate(table)
-        return found.unflatten(1, (-1, 3)).transpose(0, 1)
+        offsets_of_points = interpolate(table)
+        return offsets_of_points.unflatten(1, (-1, 3)).transpose(0, 1)

@@ -31,10 +31,10 @@ def asf_of(amc: Path) -> Path:
         DataError: when there is none, or more than one candidate.
     """
     subject, _, _ = amc.stem.partition("_")
-    found = sorted(amc.parent.glob("*.asf"))
+    paths = sorted(amc.parent.glob("*.asf"))
     named = [
-        path for path in found if path.stem in (amc.stem, subject)
-    ] or found
+        path for path in paths if path.stem in (amc.stem, subject)
+    ] or paths
     if len(named) != 1:
         raise DataError(
             f"{amc} needs its skeleton, an .asf file: found {len(named)} beside it; give "

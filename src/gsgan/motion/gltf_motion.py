@@ -150,7 +150,7 @@ def _channels(
     Others, such as the weights of shapes, are left out.
     """
     animation = glb.doc.animations[number]
-    found = {}
+    channels = {}
     for channel in animation.channels:
         node = channel.target.node
         path = channel.target.path
@@ -177,13 +177,13 @@ def _channels(
             raise ValueError("a key is not a number")
         if (np.diff(times) <= 0).any():
             raise ValueError("the times of its keys do not increase")
-        found[node, path] = _Channel(times, values, interpolation)
-    if not found:
+        channels[node, path] = _Channel(times, values, interpolation)
+    if not channels:
         raise DataError(
             f"{glb.path}: animation {animation.name or number} moves no joint of a skeleton; "
             "export it with its armature"
         )
-    return found
+    return channels
 
 
 def _frame_times(channels: Mapping[tuple[int, str], _Channel]) -> Array:

@@ -154,11 +154,11 @@ def transfer_face(p: Float, rest: Float) -> Float:
     own = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
     onto = own.repeat(len(given), 1)
-    found = _align(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
+    face = _align(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
 
     # Expressions are offsets from the other person's face at rest.
-    at_rest, _ = found.nanmedian(0)
-    return (own + found - at_rest).numpy()
+    at_rest, _ = face.nanmedian(0)
+    return (own + face - at_rest).numpy()
 
 
 def steady(p: Float) -> Float:
@@ -168,18 +168,18 @@ def steady(p: Float) -> Float:
     alignment: a jaw that drops does not nod the head.
     """
     # At first, the frame with most landmarks stands for the median.
-    found = torch.from_numpy(p)
-    seen = found.isfinite().all(-1, keepdim=True).double()
-    usual = found[seen.sum((1, 2)).argmax()]
+    aligned = torch.from_numpy(p)
+    seen = aligned.isfinite().all(-1, keepdim=True).double()
+    usual = aligned[seen.sum((1, 2)).argmax()]
     weight = seen * usual.isfinite()[:, :1]
     for _ in range(ALIGN_ROUNDS):
-        found = _align(found, usual.nan_to_num(), weight)
-        usual, _ = found.nanmedian(0)
+        aligned = _align(aligned, usual.nan_to_num(), weight)
+        usual, _ = aligned.nanmedian(0)
 
         # Cauchy's weights.
-        moved = squared_norm(found - usual) / FACE_STILL**2
+        moved = squared_norm(aligned - usual) / FACE_STILL**2
         weight = (1 / (1 + moved)).nan_to_num()
-    return found.numpy()
+    return aligned.numpy()
 
 
 def _align(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ def find_joints(names: tuple[str, ...]) -> dict[str, int]:
 
     Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
-    found: dict[str, int] = {}
+    joints: dict[str, int] = {}
     ranks: dict[str, int] = {}
     for j, name in enumerate(plain_names(names)):
         # MakeHuman's helpers and end sites are no bones.
@@ -97,9 +97,9 @@ def find_joints(names: tuple[str, ...]) -> dict[str, int]:
             continue
         bone, rank = _bone(name)
         if bone and rank < ranks.get(bone, 99):
-            found[bone] = j
+            joints[bone] = j
             ranks[bone] = rank
-    return found
+    return joints
 
 
 def _bone(name: str) -> tuple[str, int]:
@@ -329,12 +329,12 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
 
 def _count(rig: RigMotion, bone: str) -> int:
     """The number of joints that may be a bone, without the further segments below them."""
-    found = set()
+    digits = set()
     for j, name in enumerate(rig.names):
         meant, _ = _bone(name)
         if meant == bone:
-            found.add(j)
-    return sum(found.isdisjoint(_line(rig, j)) for j in found)
+            digits.add(j)
+    return sum(digits.isdisjoint(_line(rig, j)) for j in digits)
 
 
 def _line(rig: RigMotion, j: int) -> list[int]:

@@ -228,7 +228,7 @@ def refine_cameras(
         return np.concatenate([r.ravel(), priors(cameras)])
 
     # Few of the parameters act on each residual.
-    found = least_squares(
+    solution = least_squares(
         residuals,
         np.zeros(poses + p.size),
         jac_sparsity=_sparsity(camera, point, len(start), len(p), size),
@@ -239,7 +239,7 @@ def refine_cameras(
 
     # A similarity of the whole world does not change the projections, so that the search hardly
     # moves along it. The priors alone determine it.
-    cameras = cameras_at(found.x)
+    cameras = cameras_at(solution.x)
 
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))

@@ -377,10 +377,10 @@ def unsteady_clocks(cameras: CameraArray, uv: Float, weight: Float) -> Float:
             shifted[c, inside] = np.where(
                 weight[c, at[inside], :, None] > 0, uv[c, at[inside]], np.nan
             )
-        found, gain = clock_errors(
+        lag, gain = clock_errors(
             cameras, shifted, np.ones(shifted.shape[:3]), DRIFT_LAG
         )
-        parts.append(found)
+        parts.append(lag)
         gains.append(gain)
 
     # A change that matters in one of the parts.

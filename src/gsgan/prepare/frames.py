@@ -246,10 +246,10 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     if points is None or len(points) < MIN_CORNERS:
         return np.zeros(2)
     start = np.asarray(points, np.float32)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, start.copy()
     )
-    steps = (moved - start)[found.ravel() == 1].reshape(-1, 2)
+    steps = (moved - start)[status.ravel() == 1].reshape(-1, 2)
     return np.median(steps, axis=0) if len(steps) else np.zeros(2)
 
 

@@ -99,12 +99,14 @@ def calibrate_from_person(
         ]
         prior = FOCAL_PRIOR if focal is None else GIVEN_PRIOR
         try:
-            found = _solution(guess, uv, weight, time, prior)
+            calibrated = _solution(guess, uv, weight, time, prior)
         except DataError as error:
             failure = error
             continue
-        if best is None or np.nanmean(found.error) < np.nanmean(best.error):
-            best = found
+        if best is None or np.nanmean(calibrated.error) < np.nanmean(
+            best.error
+        ):
+            best = calibrated
     if best is None:
         assert failure is not None
         raise failure
@@ -191,9 +193,9 @@ def _chain(
         both = (weight[a] > 0) & (weight[b] > 0)
         if both.sum() < MIN_COMMON:
             continue
-        found = _pair(rays[a, both], rays[b, both])
-        if found is not None and (best is None or found[0] > best[0]):
-            best = (*found, a, b)
+        pose = _pair(rays[a, both], rays[b, both])
+        if pose is not None and (best is None or pose[0] > best[0]):
+            best = (*pose, a, b)
     if best is None:
         raise DataError(
             "calibration=person: no two cameras see the person at the same time often enough "

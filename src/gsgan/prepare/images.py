@@ -48,7 +48,7 @@ def find_masks(
     Raises:
         DataError: when a camera has none.
     """
-    found = {}
+    masks = {}
     for name in names:
         place = folder / name
 
@@ -68,8 +68,8 @@ def find_masks(
             raise DataError(
                 f"{place} holds no masks; expected {name}/000000.png and so on"
             )
-        found[name] = {number: folder / path for number, path in files.items()}
-    return found
+        masks[name] = {number: folder / path for number, path in files.items()}
+    return masks
 
 
 def _first_number(stem: str) -> int:

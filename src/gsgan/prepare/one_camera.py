@@ -126,10 +126,10 @@ def solve_video(
 
     # The detections in them.
     numbers = np.array(list(source.files))
-    found, masks = find_people(
+    landmark_files, masks = find_people(
         options, {source.name: source}, stages, console.print
     )
-    detected, there = _read(found[source.name], numbers, source.size)
+    detected, there = _read(landmark_files[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
 
     # Images of one whole, sharp person.
@@ -219,7 +219,7 @@ def _read(
 ) -> tuple[Detected, Bool]:
     """Detections at these frame numbers ``[F]``, and which of the frames have any."""
     # The arrays of depth, which only MediaPipe's files have; their rows are in the file's order.
-    found = landmarks.read_detections(path)
+    detections = landmarks.read_detections(path)
     depth = {
         "world": (BODY, 3),
         "left_z": (HAND,),
@@ -229,13 +229,15 @@ def _read(
     arrays = {}
     if not path.is_dir():
         arrays = read_arrays(path, ("frame_id", *depth))
-    F = len(found.frame_id)
+    F = len(detections.frame_id)
     sizes = np.array([size[::-1]])
-    px, conf = landmarks.inside(found.px[None], found.conf[None], sizes)
+    px, conf = landmarks.inside(
+        detections.px[None], detections.conf[None], sizes
+    )
 
     # Rows of `found` are by frame number.
-    at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
-    there = found.frame_id[at] == numbers
+    at = np.searchsorted(detections.frame_id, numbers).clip(max=F - 1)
+    there = detections.frame_id[at] == numbers
 
     def depths(name: str, default: float) -> Float:
         shape = (F, *depth[name])

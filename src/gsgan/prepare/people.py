@@ -64,19 +64,19 @@ def one_person(
     # All people of a frame, by camera: rays need pixels without distortion.
     rig = CameraArray.of(cameras)
     rows = {}
-    for name, found in detections.items():
+    for name, detected in detections.items():
         offset = int(offsets.get(name, 0))
-        numbers = (found.frame_id + offset).tolist()
+        numbers = (detected.frame_id + offset).tolist()
         rows[name] = dict(zip(numbers, range(len(numbers)), strict=True))
     frames = sorted(set().union(*rows.values()))
     steps = []
     for frame in frames:
         people = []
-        for camera, (name, found) in zip(
+        for camera, (name, detected) in zip(
             cameras, detections.items(), strict=True
         ):
             row = rows[name].get(frame)
-            people.append(_people(camera, found, row))
+            people.append(_people(camera, detected, row))
         steps.append(_groups(rig, people))
 
     # The way through all frames, and who is taken in each camera.
@@ -90,13 +90,13 @@ def one_person(
             "person in each file of landmarks"
         )
     result = {}
-    for c, (name, found) in enumerate(detections.items()):
+    for c, (name, detected) in enumerate(detections.items()):
         chosen = {}
         for frame, group in zip(frames, way, strict=True):
             if frame in rows[name] and (group is not None or frame in several):
                 person = -1 if group is None else group.chosen[c]
                 chosen[rows[name][frame]] = person
-        result[name] = _only(found, chosen)
+        result[name] = _only(detected, chosen)
     note = f"{text}; the one that all cameras agree on was taken"
     if failed:
         note += f", and nobody in {len(failed)} frames in which they do not"
@@ -108,9 +108,9 @@ def find_crowds(
 ) -> set[int]:
     """The common numbers of frames in which any camera shows several people."""
     several: set[int] = set()
-    for name, found in detections.items():
+    for name, detected in detections.items():
         offset = int(offsets.get(name, 0))
-        several.update(number + offset for number in found.crowded)
+        several.update(number + offset for number in detected.crowded)
     return several
 
 

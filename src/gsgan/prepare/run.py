@@ -168,10 +168,12 @@ def _from_several(
     options: Options, inputs: Inputs, stages: StageFolder, console: Console
 ) -> Solved:
     """Several cameras: detections of one person, cameras in metres, joints in 3D."""
-    found, masks = find_people(options, inputs.sources, stages, console.print)
+    landmark_files, masks = find_people(
+        options, inputs.sources, stages, console.print
+    )
     inputs = _with_shifts(inputs, "masks", masks)
     inputs, masks = _with_times(options, inputs, masks, stages)
-    inputs, detections = with_detections(inputs, found)
+    inputs, detections = with_detections(inputs, landmark_files)
     inputs, detections = with_one_person(options, inputs, detections)
     frames, uv, conf = _undistort(options, inputs, detections)
 
@@ -415,18 +417,18 @@ def _from_person(
 ) -> Inputs:
     """The inputs with cameras that are found from the person, and notes on how well they agree."""
     with console.status("finding the cameras from the person"):
-        found = calibrate_from_person(
+        calibrated = calibrate_from_person(
             inputs.cameras, uv, conf, frames / inputs.fps, options.focal
         )
     films = np.array(
         [
             camera.K[0, 0] / np.hypot(*camera.size) * FILM
-            for camera in found.cameras
+            for camera in calibrated.cameras
         ]
     )
     notes = [*inputs.notes]
     for camera, error, film in zip(
-        found.cameras, found.error, films, strict=True
+        calibrated.cameras, calibrated.error, films, strict=True
     ):
         notes.append(
             f"{camera.name}: found from the person, {error:.1f} pixels off its landmarks, focal "
@@ -435,7 +437,7 @@ def _from_person(
 
     # A focal length unlike the others is more often an error than a zoom.
     apart = films / np.median(films)
-    for camera, ratio in zip(found.cameras, apart, strict=True):
+    for camera, ratio in zip(calibrated.cameras, apart, strict=True):
         if not 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
             notes.append(
                 f"doubtful: {camera.name} has {ratio:.1f} times the median focal length; give "
@@ -443,12 +445,12 @@ def _from_person(
             )
 
     # Cameras that look the same way show no depth.
-    if found.angle < MIN_ANGLE:
+    if calibrated.angle < MIN_ANGLE:
         notes.append(
-            f"doubtful: the cameras look at the person from within {found.angle:.0f} degrees; "
+            f"doubtful: the cameras look at the person from within {calibrated.angle:.0f} degrees; "
             "positions and focal lengths are uncertain, calibrate with a board"
         )
-    return replace(inputs, cameras=found.cameras, notes=notes)
+    return replace(inputs, cameras=calibrated.cameras, notes=notes)
 
 
 def _in_metres(

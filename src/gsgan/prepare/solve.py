@@ -217,33 +217,33 @@ def solve(
     }
 
     # Swapped sides first: they would bend the cameras.
-    found = correct(cameras, scaled, weight, time)
-    stages["flips"] = found.points.error
-    refined = refine(given, found, outlines, settings)
+    corrected = correct(cameras, scaled, weight, time)
+    stages["flips"] = corrected.points.error
+    refined = refine(given, corrected, outlines, settings)
     if refined.cameras is not given:
         cameras, _ = refined.cameras.normalise(uv)
-        found = correct(cameras, scaled, weight, time)
-    stages["refined"] = found.points.error
+        corrected = correct(cameras, scaled, weight, time)
+    stages["refined"] = corrected.points.error
 
     # Impossible joints are removed; joints of hands and face, or all, are smoothed.
-    p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
-    final_weight = found.points.weight.reshape(conf.shape)
-    agreed = _mean_seen(final_weight, found.weight)
+    p, removed = cleanse(corrected.points.p.reshape(*conf.shape[1:], 3))
+    final_weight = corrected.points.weight.reshape(conf.shape)
+    agreed = _mean_seen(final_weight, corrected.weight)
     smoothed = smooth(p, agreed, time, settings.smoothing)
 
     # A body in smooth motion, from the views of all cameras.
     seen = is_known(p)
     if settings.body and seen[:, SHOULDERS].all(1).any():
         smoothed[:, :BODY] = body_joints(
-            cameras, found.uv, found.weight, p, time, settings.noise
+            cameras, corrected.uv, corrected.weight, p, time, settings.noise
         )
     p = smoothed
-    conf_seen = _mean_seen(found.weight, found.weight)
+    conf_seen = _mean_seen(corrected.weight, corrected.weight)
     inferred = np.where(is_known(p), INFERRED, 0.0)
 
     # The final errors, of detections that were used.
-    error = cameras.errors(p.reshape(-1, 3), _flat(found.uv))
-    error = np.where(found.weight > 0, error.reshape(conf.shape), np.nan)
+    error = cameras.errors(p.reshape(-1, 3), _flat(corrected.uv))
+    error = np.where(corrected.weight > 0, error.reshape(conf.shape), np.nan)
     stages["body" if settings.body else "smoothed"] = error
 
     # Errors by stage are those of the body, in pixels of each camera.
@@ -265,8 +265,8 @@ def solve(
         conf=np.where(seen & is_known(p), conf_seen, inferred),
         seen=seen,
         error=error * to_pixels,
-        flips=found.flips,
-        left_out=found.left_out,
+        flips=corrected.flips,
+        left_out=corrected.left_out,
         delay=delay,
         gain=gain,
         stages=stages_in_pixels,

@@ -55,14 +55,14 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
     dropped = [frame for frame in frames if frame not in kept]
 
     # The share of frames in which each joint came out in 3D.
-    found = is_known(solution.p[:, :BODY]).mean(0)
+    shares = is_known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {
             stage: median(px) for stage, px in solution.stages.items()
         },
         "cameras": cameras,
         "joints_found": dict(
-            zip(MEDIAPIPE33.names, found.tolist(), strict=True)
+            zip(MEDIAPIPE33.names, shares.tolist(), strict=True)
         ),
         "joints_removed": solution.removed,
         "frames": len(frames),

@@ -211,11 +211,11 @@ def points_and_cost(
     # Frames and joints are points like any others.
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
-    found = robust(
+    result = robust(
         cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf
     )
 
     # Points that were not found cost nothing here: they would favour no side.
-    seen = np.where(np.isfinite(found.error), flat, 0.0)
-    cost = robust_cost(found.error, seen)
-    return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
+    seen = np.where(np.isfinite(result.error), flat, 0.0)
+    cost = robust_cost(result.error, seen)
+    return result.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)

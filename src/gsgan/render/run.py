@@ -239,14 +239,14 @@ def from_file(
         )
 
     # One camera for all frames, or one for each; both need an image size for their window.
-    found = list(calibration.cameras.values())
-    if len(found) not in (1, len(p)):
+    cameras = list(calibration.cameras.values())
+    if len(cameras) not in (1, len(p)):
         raise DataError(
-            f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one per frame"
+            f"{path} holds {len(cameras)} cameras; expected 1, or {len(p)}, one per frame"
         )
-    if any(0 in entry.size for entry in found):
+    if any(0 in entry.size for entry in cameras):
         raise DataError(f"{path} lacks an image size; every camera needs one")
-    return cat([of_entry(entry, p, size, None, lens=True) for entry in found])
+    return cat([of_entry(entry, p, size, None, lens=True) for entry in cameras])
 
 
 # -- images
@@ -275,14 +275,14 @@ def _images(
             with torch.no_grad():
                 # Frame by frame: a long motion does not fit into the memory.
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar(
+                rendering = run.avatar(
                     p, visibility, camera, body, colours, maps=False
                 )
-            assert found.image is not None
-            assert found.alpha is not None
+            assert rendering.image is not None
+            assert rendering.alpha is not None
             yield eight_bits(
-                found.image[0].cpu(),
-                found.alpha[0].cpu(),
+                rendering.image[0].cpu(),
+                rendering.alpha[0].cpu(),
                 paint_on(camera.size),
             )
         except ValueError as error:

@@ -158,7 +158,7 @@ def find_runs(given: Sequence[str]) -> list[Path]:
         ConfigError: when an entry contains no run.
     """
     # A dict keeps the order, and has each folder once.
-    found: dict[Path, None] = {}
+    folders: dict[Path, None] = {}
     for entry in given:
         places = [str(Path(entry).expanduser())]
         if glob.has_magic(entry):
@@ -171,8 +171,8 @@ def find_runs(given: Sequence[str]) -> list[Path]:
                 f"runs: {entry!r} contains no run folder ({METRICS_FILE} or {CONFIG}); give run "
                 "folders, folders of them or globs"
             )
-        found |= dict.fromkeys(runs)
-    return list(found)
+        folders |= dict.fromkeys(runs)
+    return list(folders)
 
 
 def _runs_inside(folder: Path) -> Iterator[Path]:

@@ -469,8 +469,10 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
         departures = [run.departures for run in runs]
         if None in departures:
             notes.append("no config says whether it is experiment=paper")
-        elif found := next(filter(None, departures), None):
-            notes.append(f"differs from experiment=paper: {', '.join(found)}")
+        elif departure := next(filter(None, departures), None):
+            notes.append(
+                f"differs from experiment=paper: {', '.join(departure)}"
+            )
         else:
             whole = (spec.run, spec.variant) == ("full", FULL)
             label = NAME if whole else f"{NAME}, {label}"
@@ -508,10 +510,10 @@ def _value(
 
 def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     """Marks the best of our rows in each column that several of them have."""
-    found = [list(row.cells) for row in rows]
+    cells_by_row = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
         means = []
-        for cells in found:
+        for cells in cells_by_row:
             mean = cells[i].mean
             if mean is not None:
                 means.append(mean)
@@ -531,13 +533,13 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
 
         # Values that are printed alike are all marked.
         printed = part.write_value(metric, best)
-        for cells in found:
+        for cells in cells_by_row:
             mean = cells[i].mean
             if mean is not None and part.write_value(metric, mean) == printed:
                 cells[i] = replace(cells[i], best=True)
     return [
         replace(row, cells=cells)
-        for row, cells in zip(rows, found, strict=True)
+        for row, cells in zip(rows, cells_by_row, strict=True)
     ]
 
 

@@ -302,20 +302,20 @@ def _set_by_scene(
     body_points: BodyPoints | None,
 ) -> dict[str, Any]:
     """Arguments of Ψ that the scene or the points decide."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     if body_points is not None:
-        found["mean_step"] = body_points.mean_step
+        settings["mean_step"] = body_points.mean_step
         if body_points.scale_max is not None:
-            found["scale_max"] = body_points.scale_max
+            settings["scale_max"] = body_points.scale_max
 
     # A config with normals=null leaves it to the number of cameras.
     given = getattr(parts.deformation, "keywords", {})
     if given.get("normals", False) is None:
-        found["normals"] = scene.n_train_cameras > 1
+        settings["normals"] = scene.n_train_cameras > 1
     if effects.light.on:
         assert scene.proportions is not None
-        found["light"] = scene.proportions.up
-    return found
+        settings["light"] = scene.proportions.up
+    return settings
 
 
 def _generator(

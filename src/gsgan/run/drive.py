@@ -147,8 +147,8 @@ def drive_of(options: MotionOptions, run: Run, fps: float) -> Drive:
         DataError: when the motion cannot be read.
     """
     # With drive=skeleton the body follows from the joints, as for a motion without one.
-    found = _choose(options, run, fps)
-    return found if options.drive is None else replace(found, body=None)
+    drive = _choose(options, run, fps)
+    return drive if options.drive is None else replace(drive, body=None)
 
 
 def smooth(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
@@ -181,9 +181,9 @@ def _choose(options: MotionOptions, run: Run, fps: float) -> Drive:
         return rest_pose(run.proportions)
     if options.motion is None:
         split, _ = run.data.watched
-        found = _read_split(options, run, split)
-        frame = found.numbers[0]
-        still = found.rows(np.zeros(1, np.int64))
+        drive = _read_split(options, run, split)
+        frame = drive.numbers[0]
+        still = drive.rows(np.zeros(1, np.int64))
         return replace(
             still, text=f"frame {frame} of {split}, held still", camera=None
         )

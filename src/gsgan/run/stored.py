@@ -129,8 +129,10 @@ def _group(
     """The group that a dotted key belongs to, empty where there is none, and its last part."""
     *groups, last = key.split(".")
     for group in groups:
-        found = settings.get(group)
-        settings = found if isinstance(found, MutableMapping) else {}
+        group_settings = settings.get(group)
+        settings = (
+            group_settings if isinstance(group_settings, MutableMapping) else {}
+        )
     return settings, last
 
 
@@ -183,11 +185,11 @@ def hydra_record(folder: Path) -> DictConfig:
 
 def choices(folder: Path) -> dict[str, Any]:
     """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
-    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    recorded = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
     return (
         {}
-        if found is None
-        else {str(key): value for key, value in found.items()}
+        if recorded is None
+        else {str(key): value for key, value in recorded.items()}
     )
 
 

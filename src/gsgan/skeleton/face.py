@@ -151,5 +151,5 @@ def face_code(
     if not template.expression:
         return None
     c = constants(template, p.device, p.dtype)
-    found = in_head(p.index_select(1, c.expression), p, head, template)
-    return (found - c.face_rest) / CODE_UNIT
+    offsets = in_head(p.index_select(1, c.expression), p, head, template)
+    return (offsets - c.face_rest) / CODE_UNIT

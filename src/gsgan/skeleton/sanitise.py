@@ -139,9 +139,9 @@ def complete_skeleton(
     shown = shown.reshape(-1, shown.shape[-1])
 
     # The joints of each template are the first ones of the next larger template.
-    found = p.shape[1]
-    if found != J and {found, J} <= TEMPLATE_SIZES:
-        missing = (0, max(J - found, 0))
+    count = p.shape[1]
+    if count != J and {count, J} <= TEMPLATE_SIZES:
+        missing = (0, max(J - count, 0))
         p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
         shown = pad(shown[:, :J], missing)
     p, valid = sanitise(p, None, template, limb_length_sum)
@@ -243,9 +243,9 @@ def _fill(
             parent = known.index_select(1, level.parents)
             starts = c.starts[level.limbs]
             ends = c.ends[level.limbs]
-            found = q.index_select(1, ends) - q.index_select(1, starts)
+            directions = q.index_select(1, ends) - q.index_select(1, starts)
             known = torch.cat(
-                [known, parent @ swings(found, parent, level)], dim=1
+                [known, parent @ swings(directions, parent, level)], dim=1
             )
     return torch.where(is_seen, p, q + root)
 

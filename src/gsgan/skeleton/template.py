@@ -112,11 +112,11 @@ class SkeletonTemplate:
     @property
     def incoming(self) -> dict[int, int]:
         """Per joint at the end of a bone, the first limb that ends there."""
-        found: dict[int, int] = {}
+        edges: dict[int, int] = {}
         for limb, (_, child) in enumerate(self.limbs):
             if child not in self.torso:
-                found.setdefault(child, limb)
-        return found
+                edges.setdefault(child, limb)
+        return edges
 
     @property
     def limb_length_sum(self) -> float:

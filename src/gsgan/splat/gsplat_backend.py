@@ -59,7 +59,7 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
     """Differences between gsplat's cut-offs and the settings, one clause each."""
     # Numbers are equal up to rounding, and printed alike.
     cap, _ = _measure_cap(device)
-    found = []
+    sentences = []
     for name, value in {**COMPILED_IN, "alpha_max": cap or 0.0}.items():
         want = getattr(settings, name)
         if isinstance(value, float):
@@ -68,19 +68,19 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
         else:
             same = want == value
         if not same:
-            found.append(f"{name} is {value}, not {want}")
-    return found
+            sentences.append(f"{name} is {value}, not {want}")
+    return sentences
 
 
 def describe_limits(settings: Accuracy, device: torch.device) -> str:
     """How gsplat's result differs from the settings, in one sentence."""
-    found = [
+    sentences = [
         "it stops pixels one layer earlier",
         *differences(settings, device),
     ]
     return (
         f"Drawing with gsplat, the fastest backend here; differences from the settings "
-        f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
+        f"{settings.name!r}: {'; '.join(sentences)}; backend=torch has none."
     )
 
 

@@ -46,11 +46,11 @@ def _sort(projected: Projected) -> Projected:
     """The ellipses of each batch item, front to back."""
     # Gaussians of equal depth keep their order.
     order = projected.depths.detach().argsort(dim=1, stable=True)
-    found = {}
+    fields = {}
     for name, x in vars(projected).items():
         index = order if x.ndim == 2 else order.unsqueeze(-1).expand_as(x)
-        found[name] = x.gather(1, index)
-    return Projected(**found)
+        fields[name] = x.gather(1, index)
+    return Projected(**fields)
 
 
 def _pixel_chunks(

@@ -166,23 +166,25 @@ class _Skeleton:
     def _by_other_names(self, names: tuple[str, ...]) -> dict[int, str]:
         """Node number → Mixamo's bone name, by the names that motions have; the bones between the
         hips and the head are spine, up to the arms, and neck."""
-        found = find_joints(names)
-        if not {"Head", "LeftArm", "LeftUpLeg", "RightUpLeg"} <= set(found):
+        joints = find_joints(names)
+        if not {"Head", "LeftArm", "LeftUpLeg", "RightUpLeg"} <= set(joints):
             return {}
         above = self.glb.ancestors
 
         # Hips that are not above the head are not those of the legs.
-        head = above(found["Head"])
-        legs = set(above(found["LeftUpLeg"])) & set(above(found["RightUpLeg"]))
-        if found.get("Hips") not in head:
-            found["Hips"] = next((node for node in head if node in legs), -1)
-        if found["Hips"] < 0:
+        head = above(joints["Head"])
+        legs = set(above(joints["LeftUpLeg"])) & set(
+            above(joints["RightUpLeg"])
+        )
+        if joints.get("Hips") not in head:
+            joints["Hips"] = next((node for node in head if node in legs), -1)
+        if joints["Hips"] < 0:
             return {}
-        named = {node: bone for bone, node in found.items()}
+        named = {node: bone for bone, node in joints.items()}
 
         # Biped's arms hang on its neck, which its name tells.
-        trunk = head[: head.index(found["Hips"])][::-1]
-        above_arm = above(found["LeftArm"])
+        trunk = head[: head.index(joints["Hips"])][::-1]
+        above_arm = above(joints["LeftArm"])
         spine = []
         for node in trunk:
             if node not in above_arm or "neck" in names[node].lower():
@@ -196,7 +198,7 @@ class _Skeleton:
 
         # A bone between the spine and an arm is a collarbone.
         for side in ("Left", "Right"):
-            arm = found.get(f"{side}Arm")
+            arm = joints.get(f"{side}Arm")
             collar = None if arm is None else self.glb.above.get(arm)
             if collar is not None and collar not in named:
                 named[collar] = f"{side}Shoulder"

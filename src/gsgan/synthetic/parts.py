@@ -170,12 +170,12 @@ def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
 
 def _find_names(c: Character, names: np.ndarray) -> Ints:
     """``[F]`` the label in the name of the material, else of the mesh; -1 for skin, 0 for none."""
-    found = np.array([_label_of(surface.name) for surface in c.surfaces])[
+    labels = np.array([_label_of(surface.name) for surface in c.surfaces])[
         c.material
     ]
     distinct, which = np.unique(names, return_inverse=True)
     of_mesh = np.array([_label_of(name) for name in distinct])[which]
-    return np.where(found != 0, found, of_mesh)
+    return np.where(labels != 0, labels, of_mesh)
 
 
 def _label_of(name: str) -> int:

@@ -170,8 +170,8 @@ class DiscriminatorMaps:
             )
 
         # Through this function the image gets its gradient, and the parameters get none.
-        found = _Through.apply(self.image, (self.copy, list(terms.values())))
-        return dict(zip(terms, found, strict=True))
+        weighted = _Through.apply(self.image, (self.copy, list(terms.values())))
+        return dict(zip(terms, weighted, strict=True))
 
     @property
     def difference(self) -> Tensor:

@@ -429,11 +429,11 @@ class AvatarTraining(LightningModule):
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
     def _optimisers(self) -> dict[str, Any]:
-        found = self.optimizers()
+        optimisers = self.optimizers()
         return dict(
             zip(
                 self._names,
-                found if isinstance(found, list) else [found],
+                optimisers if isinstance(optimisers, list) else [optimisers],
                 strict=True,
             )
         )
@@ -446,15 +446,15 @@ class AvatarTraining(LightningModule):
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
         # A failure is kept until all processes know of it.
-        found = None
+        result = None
         problem = ""
         try:
-            found = compute()
+            result = compute()
         except ValueError as error:
             problem = str(error)
 
         # All processes skip the iteration if one of them must.
-        failed = found is None
+        failed = result is None
         if self.processes > 1:
             # A process that skips alone would leave the others waiting.
             flag = torch.tensor(float(failed), device=self.device)
@@ -462,7 +462,7 @@ class AvatarTraining(LightningModule):
 
         # A failed iteration counts as skipped.
         if not failed:
-            return found
+            return result
         self._skip(problem or "another process could not render its images")
         return None
 

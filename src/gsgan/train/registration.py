@@ -168,13 +168,13 @@ def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         total = 0.0
         for fold in range(FOLDS):
             left_out = torch.arange(len(offsets)) % FOLDS == fold
-            found = inputs[:, left_out] @ fit_columns(~left_out, ridge)
-            total += float((wanted[:, left_out] - found).square().sum())
+            residual = inputs[:, left_out] @ fit_columns(~left_out, ridge)
+            total += float((wanted[:, left_out] - residual).square().sum())
         return total
 
     every = torch.ones(len(offsets), dtype=torch.bool)
-    found = fit_columns(every, min(RIDGES, key=error)).to(offsets)
-    return found[:, -1], found[:, :-1]
+    weights = fit_columns(every, min(RIDGES, key=error)).to(offsets)
+    return weights[:, -1], weights[:, :-1]
 
 
 @dataclass(frozen=True)
@@ -374,13 +374,13 @@ class MovingSurface:
             moved = self._move(frame.pose, offsets)
 
             # The normal equations of all views: J δ is the flow.
-            found = pool.map(
+            systems = pool.map(
                 lambda view, moved=moved: self._equations(view, moved, texture),
                 frame.views,
             )
             square = self.regulariser.copy()
             right = -self.regulariser @ (offsets - mean).T.ravel()
-            for part, side in found:
+            for part, side in systems:
                 square += part / per_control
                 right += side / per_control
             change = linalg.solve(square, right, assume_a="pos")
@@ -555,7 +555,7 @@ def sample_image(image: Float, pixels: Float) -> Float:
     rows = np.array_split(
         (pixels - 0.5).astype(np.float32), len(pixels) // 32_000 + 1
     )
-    found = [
+    samples = [
         cv2.remap(
             image,
             part[:, None, 0].copy(),
@@ -565,7 +565,7 @@ def sample_image(image: Float, pixels: Float) -> Float:
         )
         for part in rows
     ]
-    return np.concatenate(found)[:, 0]
+    return np.concatenate(samples)[:, 0]
 
 
 def projection_slope(camera: Camera, means: Tensor) -> Tensor:

@@ -122,11 +122,11 @@ def derive(
 
     # A change in place raises the version; a move or a cast changes the address or dtype.
     state = [(x.data_ptr(), x._version, x.dtype) for x in weights]
-    found = kept.get(name)
-    if found is None or found[0] != state:
+    entry = kept.get(name)
+    if entry is None or entry[0] != state:
         with torch.inference_mode(False), torch.no_grad():
-            found = kept[name] = state, make()
-    return found[1]
+            entry = kept[name] = state, make()
+    return entry[1]
 
 
 def farthest_points(points: Tensor, count: int) -> Tensor:

@@ -59,20 +59,20 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
         numbers[shot.name] = {}
         for subject in subjects:
             image = subject.image(shot)
-            found = measure(image, shot.truth)
+            scores = measure(image, shot.truth)
             rows[subject.name].append(
-                Panel(image, format_number(found["psnr"], 2, " dB"))
+                Panel(image, format_number(scores["psnr"], 2, " dB"))
             )
 
             # The details beside the image, with their own score.
             for name, box in boxes.items():
                 part = image[..., *box]
                 score = finite(psnr(part, shot.truth[..., *box]))
-                found[f"psnr_{name.replace(' ', '_')}"] = score
+                scores[f"psnr_{name.replace(' ', '_')}"] = score
                 rows[subject.name].append(
                     Panel(part, format_number(score, 2, " dB"))
                 )
-            numbers[shot.name][subject.name] = found
+            numbers[shot.name][subject.name] = scores
 
     # One title per column, one name per row.
     figure, _ = draw_panels(

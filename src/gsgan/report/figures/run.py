@@ -88,15 +88,15 @@ def comparison(
         above = [Panel(shot.truth)]
         below = [Panel(true_detail)]
         for name, image in held.items():
-            found = numbers[shot.name][name]
+            value = numbers[shot.name][name]
             note = (
-                f"{_decibels(found)}\nF1 {format_number(found['edge_f1'], 3)}"
+                f"{_decibels(value)}\nF1 {format_number(value['edge_f1'], 3)}"
             )
             above.append(Panel(image, note))
             if detail:
                 magnified = image[..., *box]
                 score = finite(psnr(magnified, true_detail))
-                found["psnr_detail"] = score
+                value["psnr_detail"] = score
                 below.append(Panel(magnified, format_number(score, 2, " dB")))
         panels.append(above)
         if detail:
@@ -236,10 +236,10 @@ def make_figures(config: DictConfig) -> None:
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
 
     # The numbers and captions are of all figures together.
-    found: set[str] = set()
+    files: set[str] = set()
     for subject in subjects:
-        found.update(subject.marks)
-    marks = sorted(found)
+        files.update(subject.marks)
+    marks = sorted(files)
     _write_record(out, made, subjects, marks)
     lines = [f"marked: {mark}" for mark in marks]
     lines.append(
