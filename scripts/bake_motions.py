@@ -108,7 +108,7 @@ class Subject:
             for name, shape in self.thinned.shapes.items():
                 if name in motion.shapes and not name.startswith("blink"):
                     offsets += motion.shapes[name][f] * shape
-            posed = self.thinned.skinned(R, motion.joints[f], offsets)
+            posed = self.thinned.skin(R, motion.joints[f], offsets)
             points.append(posed[0])
         return np.stack(points)
 

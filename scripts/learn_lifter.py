@@ -109,7 +109,7 @@ class Poses:
                 coefficients=0.8 * torch.randn(space.coefficients).double(),
                 stretch=usual.stretch + 0.05 * torch.randn(len(usual.stretch)),
             )
-            body = space.shaped(shape)
+            body = space.body_of(shape)
             landmarks = body.landmarks[:BODY].nan_to_num()
             self.bodies.append((body.joints.float(), landmarks.float()))
 

@@ -171,7 +171,7 @@ def build(tiny):
         data = build_data(config)
         return (
             data,
-            build_avatar(config, data.info, data.labelled("train")),
+            build_avatar(config, data.info, data.select_labelled("train")),
             data.dataset("train")[0],
         )
 

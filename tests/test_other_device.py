@@ -17,7 +17,7 @@ from gsgan.evaluate.predictions import BodyBoxes, Preparation
 from gsgan.evaluate.scores import Scorer, Tally, painter
 from gsgan.fit.fitter import Fitter
 from gsgan.fit.frames import MaskedFrames
-from gsgan.model.harmonic import distilled
+from gsgan.model.harmonic import distil
 from gsgan.scene import BodyPose
 from gsgan.train.callbacks import WholeSchedule
 from gsgan.train.run import build_training
@@ -90,10 +90,10 @@ def test_an_avatar_is_distilled_there(build, monkeypatch):
     avatar.freeze()
     poses = [(frame.skeleton, frame.visibility, None)] * 3
     avatar.body_pose(frame.skeleton, frame.visibility)  # constants of the host
-    expected = distilled(avatar, poses, keep_offsets=False)
+    expected = distil(avatar, poses, keep_offsets=False)
     image = expected.render(frame.skeleton, frame.camera)
     with other_device(monkeypatch) as there:
-        found = distilled(avatar.to(there), poses, keep_offsets=False)
+        found = distil(avatar.to(there), poses, keep_offsets=False)
         shown = found.render(frame.skeleton, frame.camera)
     assert isinstance(shown, Remote)
     torch.testing.assert_close(shown.held, image, atol=1e-4, rtol=0)

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 import gsgan
-from gsgan.render.output import encoded
+from gsgan.render.output import encode_video
 from gsgan.run.shared import DEMO_MOTION
-from gsgan.utils.provenance import marked_mp4
+from gsgan.utils.provenance import mark_mp4
 
 SIDE = 256  # pixels
 FPS = 25
@@ -47,7 +47,7 @@ def main(
             camera = camera_at(2 * math.pi * i / len(skeletons), centre)
             image = avatar.render(skeleton, camera, background=1.0)[0]
             images.append((255 * image).byte().permute(1, 2, 0).numpy())
-    out.write_bytes(marked_mp4(encoded(images, FPS)))  # marked as synthetic
+    out.write_bytes(mark_mp4(encode_video(images, FPS)))  # marked as synthetic
     print(f"{out}: {len(images)} frames")
 
 

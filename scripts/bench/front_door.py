@@ -124,7 +124,7 @@ class Film:
         points = []
         for scene, frame in self.scenes:
             motion = scene.motion
-            vertices, _ = scene._skinned(frame)
+            vertices, _ = scene._skin(frame)
             points.append(
                 scene.character.landmarks(vertices, motion.joints[frame])
             )
@@ -181,7 +181,7 @@ class Room:
         disc = np.random.default_rng(0).uniform(-1, 1, (SHADOW_RAYS, 2))
         disc = np.tile(disc, (len(y), 1)) * person.light.spread
         towards = person._sun_directions(disc.astype(np.float32))
-        lit = ~person.tracer.blocked(start, towards)
+        lit = ~person.tracer.is_blocked(start, towards)
         light = np.ones(part.shape[:2], np.float32)
         share = lit.reshape(-1, SHADOW_RAYS).mean(1)
         light[y, x] = SKY_LIGHT + (1 - SKY_LIGHT) * share
@@ -199,7 +199,7 @@ def trace(film: Film, truth: Path, source: Path, part: int, parts: int) -> None:
         last = source / film.names[-1] / f"{f:06d}.png"
         if last.is_file():
             continue
-        people = [scene.posed(middle + k) for k in (-1, 0, 1)]
+        people = [scene.pose(middle + k) for k in (-1, 0, 1)]
         for name, view in [*film.views.items()][::-1]:
             # The truth is sharp.
             image, alpha, _ = people[1].render(view, 16)

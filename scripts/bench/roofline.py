@@ -28,7 +28,7 @@ from gsgan.bench.speed import (
     measure,
     without_denormals,
 )
-from gsgan.model.avatar import Avatar, unwatched
+from gsgan.model.avatar import Avatar, watch_nothing
 from gsgan.scene import Camera, Frame, Gaussians
 from gsgan.splat import Accuracy
 from gsgan.splat.project import project
@@ -142,7 +142,7 @@ def stage_work(avatar: Avatar, frame: Frame) -> pd.DataFrame:
         try:
             painting = avatar(*frame.inputs)
         finally:
-            avatar.stage = unwatched  # type: ignore[method-assign]
+            avatar.stage = watch_nothing  # type: ignore[method-assign]
     window = avatar.window(frame.skeleton, frame.camera)
     camera = frame.camera if window is None else window.camera(frame.camera)
     splatted = [("F", painting.gaussians, avatar.accuracy)]

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gsgan.body import Body
 from gsgan.body.lbs import axis_angle_to_matrix
-from gsgan.body.shape import shaped_body
+from gsgan.body.shape import shape_body
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_hands, fit_shape
 from gsgan.motion.character import Animation, Character
@@ -77,7 +77,7 @@ def truth(
     for clip in clips:
         motion = animation(character, clip)
         for R, joints in zip(motion.rotations, motion.joints, strict=True):
-            vertices = character.skinned(R, joints)[0]
+            vertices = character.skin(R, joints)[0]
             marks.append(character.landmarks(vertices, joints)[:JOINTS])
             points.append(vertices[chosen])
     return tuple(torch.from_numpy(np.stack(x)).float() for x in (marks, points))
@@ -162,9 +162,9 @@ def errors(
     seen = torch.ones(len(marks), JOINTS)
     shape = fit_shape(marks[:, :33], seen[:, :33])
     shape = fit_hands(
-        shape, Solver(shaped_body(shape)).solve(marks, seen), marks, seen
+        shape, Solver(shape_body(shape)).solve(marks, seen), marks, seen
     )
-    body = shaped_body(shape)
+    body = shape_body(shape)
     solver = Solver(body)
     pose = {
         name: solver.solve(p, torch.ones(p.shape[:2]))

@@ -64,7 +64,7 @@ def main() -> None:
     train, test = np.array(scene.train_frames), np.array(scene.test_frames)
     points, off = [], []
     for f in range(len(t)):
-        v, normals = scene._skinned(f)
+        v, normals = scene._skin(f)
         moved, _, _ = scene.secondary(
             float(t[f]), scene.motion.rotations[f], v, normals
         )
@@ -84,7 +84,7 @@ def main() -> None:
 
     def surface(at):
         skinned = (
-            scene.character.skinned(R, p, 0)[0]
+            scene.character.skin(R, p, 0)[0]
             for R, p in zip(at.rotations, at.joints, strict=True)
         )
         return np.stack([v[keep] for v in skinned])

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import torch
 
-from gsgan.bench.speed import timed
+from gsgan.bench.speed import measure_ms
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -43,15 +43,15 @@ def interleaved(
         )
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
-        first = timed(action, device)
+        first = measure_ms(action, device)
         slow = first > 1000 * patience
-        samples[name] = [min(first, timed(action, device))] if slow else []
+        samples[name] = [min(first, measure_ms(action, device))] if slow else []
         if tick:
             tick()
     quick = [name for name in actions if not samples[name]]
     for _ in range(repeats):
         for name in quick:
-            samples[name].append(timed(actions[name], device))
+            samples[name].append(measure_ms(actions[name], device))
             if tick:
                 tick()
     return samples

@@ -280,7 +280,7 @@ class Frame(TensorRecord):
             self.camera_index,
         )
 
-    def unpacked(self) -> Frame:
+    def unpack(self) -> Frame:
         """The frame with images in [0, 1] and labels as int64, of one whose pixels are bytes.
 
         A quarter to an eighth as much is then loaded and moved to a device.
@@ -530,11 +530,11 @@ def fold_radius(dist: Tensor) -> Tensor:
     """
     if dist.requires_grad or torch.compiler.is_compiling():
         return _fold_radius(dist)
-    if (found := _folds.get(dist)) is None:
+    if (radius := _folds.get(dist)) is None:
         # else of no use in training later
         with torch.inference_mode(False), torch.no_grad():
-            found = _folds[dist] = _fold_radius(dist)
-    return found
+            radius = _folds[dist] = _fold_radius(dist)
+    return radius
 
 
 _folds: WeakTensorKeyDictionary = WeakTensorKeyDictionary()

@@ -18,7 +18,7 @@ from gsgan.bench.speed import (
     spread,
     text,
 )
-from gsgan.model.avatar import UNWATCHED, unwatched
+from gsgan.model.avatar import UNWATCHED, watch_nothing
 from gsgan.utils.errors import ConfigError
 
 ALL = [
@@ -80,12 +80,12 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
     assert (
         (stages.p10 <= stages["median"]) & (stages["median"] <= stages.p90)
     ).all()
-    assert avatar.stage is unwatched
+    assert avatar.stage is watch_nothing
     assert avatar.stage("F") is UNWATCHED
     avatar.generator.forward = None  # a stage that fails
     with pytest.raises(TypeError, match="not callable"):
         measure(avatar, painter, [frame], count=1, warmup=0)
-    assert avatar.stage is unwatched
+    assert avatar.stage is watch_nothing
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsgan.body import axis_angle_to_matrix, free_body
 from gsgan.body.fingers import Fingers
-from gsgan.body.shape import STRETCHED, BodyShape, free_space, shaped_body
+from gsgan.body.shape import STRETCHED, BodyShape, free_space, shape_body
 from gsgan.body.solve import Solver, log_of
 from gsgan.fit.shape import fit_hands
 from gsgan.scene import BodyPose
@@ -253,7 +253,7 @@ def test_gradients_reach_landmarks_and_shape(poses):
     )
     p, seen = shown(poses[3:4])
     p.requires_grad_()
-    theta = Solver(shaped_body(shape)).solve(p, seen).theta
+    theta = Solver(shape_body(shape)).solve(p, seen).theta
     others = [i for i in range(theta.shape[1]) if i not in JOINTS]
     of = shape.coefficients, shape.stretch, p
     for joints, shown_by in ((JOINTS, LEFT), (others, slice(33))):
@@ -300,7 +300,7 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
         [[[0.01, -0.01, 0.0], [-0.01, 0.0, -0.015]]]
     ) * torch.tensor([[[1.0, 1, 1]], [[-1.0, 1, 1]]])
     stretch = torch.tensor([1.0] * 4 + [1.2] + [1.0] * 3)
-    person = shaped_body(
+    person = shape_body(
         replace(own, stretch=stretch, offsets=torch.zeros(33, 3), hands=moves)
     )
     p = torch.cat(
@@ -329,8 +329,8 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
     wild = p.clone()
     wild[:, LEFT] += 0.3
     assert not fit_hands(shape, truth, wild, seen).hands[0].any()
-    solved = Solver(shaped_body(found)).solve(p[1:], seen[1:])
-    off = (shaped_body(found).posed_hands(solved) - p[1:, 33:]).norm(dim=-1)
+    solved = Solver(shape_body(found)).solve(p[1:], seen[1:])
+    off = (shape_body(found).posed_hands(solved) - p[1:, 33:]).norm(dim=-1)
     assert off.median() < 0.003
 
 
@@ -339,7 +339,7 @@ def test_where_hands_are_on_the_arms_has_gradients(poses):
     shape = replace(
         free_space().neutral(), offsets=torch.zeros(33, 3), hands=hands
     )
-    body = shaped_body(shape)
+    body = shape_body(shape)
     total = (
         body.posed_vertices(poses[:2]).sum() + body.posed_hands(poses[:2]).sum()
     )

@@ -15,7 +15,7 @@ from gsgan.body.lbs import (
     forward_kinematics,
     kinematic_levels,
     skin,
-    stretched,
+    stretch_jacobian,
 )
 from gsgan.body.skinned import SkinnedBody, WeightGradients
 from gsgan.scene import BodyPose
@@ -174,7 +174,9 @@ def test_the_jacobian_predicts_where_neighbours_go(bent_tube, turn):
         BodyPose(theta=theta, transl=torch.zeros(1, 3, dtype=D))
     )
     A, t = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
-    J = stretched(A, bones, bent_tube.vertices, *stretch_terms(bent_tube))
+    J = stretch_jacobian(
+        A, bones, bent_tube.vertices, *stretch_terms(bent_tube)
+    )
     posed = skin(bent_tube.vertices, A, t)[0]
     inner = torch.arange(24 * 30, 24 * 50)
     # 2.5 cm
@@ -204,12 +206,12 @@ def test_the_stretch_has_a_limit(bent_tube, limit):
     )
     A, _ = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
     given = (A, bones, bent_tube.vertices, *stretch_terms(bent_tube))
-    pulled = torch.linalg.matrix_norm(stretched(*given) - A)
-    limited = torch.linalg.matrix_norm(stretched(*given, limit) - A)
+    pulled = torch.linalg.matrix_norm(stretch_jacobian(*given) - A)
+    limited = torch.linalg.matrix_norm(stretch_jacobian(*given, limit) - A)
     assert pulled.max() > 2 * limit
     torch.testing.assert_close(limited, pulled.clamp_max(limit))
     # A Gaussian is then longer by this share at most.
-    longest = torch.linalg.matrix_norm(stretched(*given, limit), ord=2)
+    longest = torch.linalg.matrix_norm(stretch_jacobian(*given, limit), ord=2)
     assert longest.max() <= 1 + limit + 1e-9
 
 
@@ -218,7 +220,9 @@ def test_all_bones_turned_alike_stretch_nothing_far_from_the_origin(bent_tube):
     bones[..., :3, :3] = rz(70).float()
     bones[..., :3, 3] = torch.tensor([500.0, -3.0, 1.0])
     A, _ = blend_transforms(bones, bent_tube.bone_index, bent_tube.bone_weight)
-    J = stretched(A, bones, bent_tube.vertices, *stretch_terms(bent_tube))
+    J = stretch_jacobian(
+        A, bones, bent_tube.vertices, *stretch_terms(bent_tube)
+    )
     torch.testing.assert_close(
         J[0], rz(70).float().expand_as(J[0]), atol=1e-5, rtol=0
     )

@@ -16,7 +16,7 @@ from gsgan.body.shape import (
     free_space,
     group_of,
     limb_axes,
-    shaped_body,
+    shape_body,
 )
 from gsgan.body.solve import Solver
 from gsgan.fit.shape import fit_shape
@@ -55,7 +55,7 @@ def test_the_asset_is_small_and_its_origin_is_the_free_body():
     assert (
         free_body_path().with_name("body_space.npz").stat().st_size < 1_000_000
     )
-    own, body = free_body(), free_space().shaped(free_space().neutral())
+    own, body = free_body(), free_space().body_of(free_space().neutral())
     for name in ("vertices", "joints", "landmarks", "hand_landmarks"):
         torch.testing.assert_close(
             getattr(body, name), getattr(own, name), atol=1e-6, rtol=0
@@ -69,9 +69,9 @@ def test_the_first_coefficient_is_mostly_size_and_people_stay_symmetric():
     for value in (-1.0, 0.0, 1.0):
         c = torch.zeros(K)
         c[0] = value
-        heights.append(stature(shaped_body(BodyShape(c, torch.ones(8)))))
+        heights.append(stature(shape_body(BodyShape(c, torch.ones(8)))))
     assert min(abs(a - b) for a, b in pairwise(heights)) > 0.15
-    body = shaped_body(other(0))
+    body = shape_body(other(0))
     for left, right in ((23, 24), (25, 26), (15, 16), (7, 8)):
         mirrored = body.landmarks[right] * torch.tensor([-1.0, 1, 1])
         torch.testing.assert_close(
@@ -103,7 +103,7 @@ def test_a_stretch_scales_its_part_alone():
     for i, group in enumerate(STRETCHED):
         stretch = torch.ones(8)
         stretch[i] = 1.2
-        body = shaped_body(BodyShape(torch.zeros(K), stretch))
+        body = shape_body(BodyShape(torch.zeros(K), stretch))
         for name, pair in pairs.items():
             expected = 1.2 if name == group else 1.0
             assert length(body, *pair) / length(own, *pair) == pytest.approx(
@@ -120,7 +120,7 @@ def test_limbs_keep_their_girth():
     of_arm = (own.bone_index[:, 0] == arm) & (own.bone_weight[:, 0] > 0.99)
     stretch = torch.ones(8)
     stretch[STRETCHED.index("forearm")] = 1.3
-    body = shaped_body(BodyShape(torch.zeros(K), stretch))
+    body = shape_body(BodyShape(torch.zeros(K), stretch))
 
     def girth(b) -> torch.Tensor:
         off = b.vertices[of_arm] - b.joints[arm]
@@ -144,17 +144,17 @@ def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
             torch.zeros(K), torch.ones(8), hands=torch.zeros(2, 3)
         ),
         lambda: BodyShape.of_flat(torch.zeros(20)),
-        lambda: shaped_body(BodyShape(torch.zeros(11), torch.ones(8))),
+        lambda: shape_body(BodyShape(torch.zeros(11), torch.ones(8))),
     ):
         with pytest.raises(ValueError, match=r"expected|at most"):
             make()
 
 
 def test_a_shape_is_found_from_skeletons():
-    true = shaped_body(other(1))
+    true = shape_body(other(1))
     p = true.posed_landmarks(moving(true))
     shape = fit_shape(p, torch.ones(p.shape[:2]))
-    found = shaped_body(shape)
+    found = shape_body(shape)
     assert stature(found) == pytest.approx(stature(true), abs=0.03)
     pose = Solver(found).solve(p, torch.ones(p.shape[:2]))
     assert (found.posed_landmarks(pose) - p).norm(dim=-1).median() < 0.003
@@ -172,12 +172,12 @@ def test_a_child_and_a_very_tall_person_are_found(stature_wanted):
     }
     person = replace(body, **scaled)
     p = person.posed_landmarks(moving(body))
-    found = shaped_body(fit_shape(p, torch.ones(p.shape[:2])))
+    found = shape_body(fit_shape(p, torch.ones(p.shape[:2])))
     assert stature(found) == pytest.approx(stature_wanted, abs=0.04)
 
 
 def test_one_frame_gaps_and_noise_still_give_a_person():
-    body = shaped_body(other(4))
+    body = shape_body(other(4))
     p = body.posed_landmarks(moving(body))
     p = p + 0.01 * torch.randn(
         p.shape, generator=torch.Generator().manual_seed(0)
@@ -185,7 +185,7 @@ def test_one_frame_gaps_and_noise_still_give_a_person():
     seen = torch.ones(p.shape[:2])
     p[:, 15], seen[:, 31] = float("nan"), 0
     for part in (slice(0, 1), slice(None)):
-        found = shaped_body(fit_shape(p[part], seen[part]))
+        found = shape_body(fit_shape(p[part], seen[part]))
         assert stature(found) == pytest.approx(stature(body), abs=0.08)
     seen[:, 11] = 0
     with pytest.raises(DataError, match="both shoulders"):
@@ -194,10 +194,10 @@ def test_one_frame_gaps_and_noise_still_give_a_person():
 
 def test_an_upper_body_has_a_shape():
     """Hips and legs that are never seen keep the lengths of the mean person."""
-    body = shaped_body(other(4))
+    body = shape_body(other(4))
     p, seen = body.posed_landmarks(moving(body)), torch.ones(20, 33)
     seen[:, 23:] = 0
-    found = shaped_body(fit_shape(p, seen))
+    found = shape_body(fit_shape(p, seen))
     arm = [(b.landmarks[11] - b.landmarks[13]).norm() for b in (found, body)]
     torch.testing.assert_close(*arm, atol=0.01, rtol=0)
     assert stature(found) == pytest.approx(stature(body), abs=0.15)
@@ -206,7 +206,7 @@ def test_an_upper_body_has_a_shape():
 def test_the_depth_of_the_spine_is_found_where_the_trunk_bends():
     found = []
     for depth in (0.0, 0.07):
-        body = shaped_body(
+        body = shape_body(
             BodyShape(
                 torch.zeros(K), torch.ones(8), spine=torch.tensor([depth])
             )

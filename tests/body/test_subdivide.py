@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from gsgan.body import free_body
-from gsgan.body.subdivide import subdivided
+from gsgan.body.subdivide import subdivide
 from gsgan.model.body_points import BodyPoints, points_for
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError
@@ -24,14 +24,14 @@ def mesh(body) -> trimesh.Trimesh:
 
 
 def test_a_smaller_count_changes_nothing(body):
-    assert subdivided(body, 100) is body
+    assert subdivide(body, 100) is body
 
 
 @pytest.mark.parametrize("more", [1, 1000, 30_000, 100_000])
 def test_the_surface_stays(body, more):
     """Area, volume, orientation and closedness; the body's own vertices come first."""
     count = len(body.vertices) + more
-    finer = subdivided(body, count)
+    finer = subdivide(body, count)
     assert len(finer.vertices) == len(finer.template) == count
     assert torch.equal(finer.vertices[: len(body.vertices)], body.vertices)
     before = mesh(body)
@@ -45,8 +45,8 @@ def test_the_surface_stays(body, more):
 
 
 def test_the_longest_edges_are_halved_first(body):
-    finer = subdivided(body, len(body.vertices) + 3000)
-    before = mesh(subdivided(body, 0))
+    finer = subdivide(body, len(body.vertices) + 3000)
+    before = mesh(subdivide(body, 0))
     before.vertices = body.template.numpy()
     order = np.argsort(before.edges_unique_length)
     kept = set(map(tuple, mesh(finer).edges_unique.tolist()))
@@ -56,7 +56,7 @@ def test_the_longest_edges_are_halved_first(body):
 
 
 def test_new_vertices_move_with_their_edge(body):
-    finer = subdivided(body, len(body.vertices) + 500)
+    finer = subdivide(body, len(body.vertices) + 500)
     sums = finer.bone_weight.sum(1)
     torch.testing.assert_close(sums, torch.ones_like(sums))
     theta = torch.zeros(1, len(body.joints), 3)

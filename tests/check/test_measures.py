@@ -10,7 +10,7 @@ from make import edit_json, edit_npz
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.sections import geometry_findings, geometry_of
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import complete, measure, sampled_items, subject_of
+from gsgan.check.views import complete, measure, sample_items, subject_of
 from gsgan.data.datamodule import GsganData
 from gsgan.utils.errors import ConfigError
 
@@ -18,7 +18,7 @@ SAMPLING = Sampling(images=8)
 
 
 def test_images_are_the_same_moments_in_every_camera(subject):
-    items = sampled_items(subject, 12)
+    items = sample_items(subject, 12)
     frames = {
         camera: [f for c, f in items if c == camera]
         for camera in subject.cameras

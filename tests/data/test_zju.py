@@ -228,7 +228,7 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert data.layout.frames == (0, 1, 2)
     info = data.info
     assert (info.body, info.n_labels) == ("smpl", 20)
-    avatar = build_avatar(config, info, data.labelled("train")).eval()
+    avatar = build_avatar(config, info, data.select_labelled("train")).eval()
     painting = avatar(*data.dataset("train")[0].inputs)
     assert "class vote over 9 images" in avatar.segmentation_why
     assert painting.segmentation.shape == (

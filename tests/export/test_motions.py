@@ -13,15 +13,15 @@ import trimesh
 from commands import refused
 
 from gsgan.body import free_body
-from gsgan.body.shape import free_space, shaped_body
+from gsgan.body.shape import free_space, shape_body
 from gsgan.body.skinned import carry
 from gsgan.body.smpl import read_smpl
 from gsgan.export.glb import to_y_up
 from gsgan.export.motions import (
     BodyMotion,
     bvh_text,
-    captured_motion,
     motion_glb,
+    read_captured,
 )
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.gltf_file import GltfFile, local_matrix
@@ -37,7 +37,7 @@ def person():
     """The free body in a shape of its own."""
     shape = free_space().neutral()
     shape.stretch[:2] = 1.2
-    return shaped_body(replace(shape, offsets=0.02 * torch.ones(33, 3)))
+    return shape_body(replace(shape, offsets=0.02 * torch.ones(33, 3)))
 
 
 def joints_of(motion: BodyMotion) -> np.ndarray:
@@ -55,7 +55,7 @@ def test_bvh_is_read_back_within_a_millimetre(tmp_path, person, dance, up):
     rig = read_bvh(path)
     assert rig.frame_time == pytest.approx(1 / 25)
     at = [rig.names.index(name) for name in person.joint_names]
-    found = rig.posed()[:, at] / 100
+    found = rig.pose()[:, at] / 100
     assert np.abs(found - joints_of(motion)).max() < MILLIMETRE
     turned = (
         to_y_up(up)
@@ -74,7 +74,7 @@ def test_glb_is_read_back_within_a_millimetre(tmp_path, person, dance):
     assert rig.frame_time == pytest.approx(1 / 25)
     assert part == ""
     at = [rig.names.index(name) for name in person.joint_names]
-    found = rig.posed()[:, at]
+    found = rig.pose()[:, at]
     assert np.abs(found - joints_of(motion)).max() < MILLIMETRE
 
 
@@ -154,7 +154,7 @@ def test_a_body_of_smpl(tmp_path, shared):
     rig = read_bvh(out)
     at = [rig.names.index(name) for name in body.joint_names]
     assert (
-        np.abs(rig.posed()[:, at] / 100 - joints_of(motion)).max() < MILLIMETRE
+        np.abs(rig.pose()[:, at] / 100 - joints_of(motion)).max() < MILLIMETRE
     )
 
 
@@ -166,7 +166,7 @@ def test_a_capture_and_a_run(capture, on_body, tmp_path, inside, kind):
     result = inside("export", f"capture={capture}", *given)
     assert result.returncode == 0, result.stderr
     assert "6 frames at 30" in result.stdout
-    motion = captured_motion(Path(capture), None, 30.0)
+    motion = read_captured(Path(capture), None, 30.0)
     expected = (
         bvh_text(motion).encode() if kind == "bvh" else motion_glb(motion)
     )
@@ -187,7 +187,7 @@ def test_a_capture_and_a_run(capture, on_body, tmp_path, inside, kind):
     truth = joints_of(motion)[4:]
     at = [rig.names.index(name) for name in motion.body.joint_names]
     unit = 100 if kind == "bvh" else 1
-    assert np.abs(rig.posed()[:, at] / unit - truth).max() < MILLIMETRE
+    assert np.abs(rig.pose()[:, at] / unit - truth).max() < MILLIMETRE
 
 
 def test_what_has_no_motion_is_refused(bare, capture, tmp_path, inside):

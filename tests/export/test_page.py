@@ -18,12 +18,12 @@ import torch
 from commands import refused
 from PIL import Image
 
-from gsgan.export.page import WEB, block, page, quantised
+from gsgan.export.page import WEB, block, page, quantise
 from gsgan.run.drive import Drive
 from gsgan.run.runs import Run
 from gsgan.scene import Camera
 from gsgan.utils.provenance import verify
-from gsgan.view.drag import dragged, position
+from gsgan.view.drag import drag, position
 
 ESBUILD = WEB / "node_modules" / ".bin" / "esbuild"
 SIDE = 96  # pixels of compared images
@@ -208,7 +208,7 @@ def test_a_dragged_hand_moves_as_in_the_viewer(opened, avatar):
         made.evaluate(
             "([n, x]) => gsgan.avatar.drag(n, x)", [name, target.tolist()]
         )
-        p = torch.from_numpy(dragged(before, name, target))[None].float()
+        p = torch.from_numpy(drag(before, name, target))[None].float()
         pose = run.avatar.body_pose(p, torch.ones(p.shape[:2]))
         truth = run.body.posed_landmarks(pose)[0]
         found = np.array(made.evaluate("gsgan.avatar.landmarks"))[:33]
@@ -335,10 +335,10 @@ def test_the_script_is_built_from_its_sources(tmp_path):
 
 def test_quantised_values():
     values = np.array([[0.0, 0.0], [1.0, -2.0]])
-    found, step = quantised(values, 127)
+    found, step = quantise(values, 127)
     assert found.tolist() == [[0, 0], [64, -127]]
     np.testing.assert_allclose(step[1], 2 / 127)
-    assert quantised(values, 32767)[0].dtype == np.int16
+    assert quantise(values, 32767)[0].dtype == np.int16
 
 
 def test_an_avatar_without_a_body_is_refused(bare, inside):

@@ -16,14 +16,14 @@ from hydra.utils import instantiate
 from make import edit_npz, write_hands, write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
-from gsgan.body.shape import BodyShape, free_space, shaped_body
+from gsgan.body.shape import BodyShape, free_space, shape_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import spread_frames
 from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import ScoreOptions, make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.frames import MaskedFrames, rotated
+from gsgan.fit.frames import MaskedFrames, rotate_cameras
 from gsgan.fit.run import fit_before_training, refuse_other_fit, run_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import moves_with_body
@@ -45,7 +45,7 @@ def ready(people: Path, compose, *overrides: str, turn: float = 0.0) -> Fitter:
     frames = MaskedFrames(
         instantiate(config.data, _convert_="all"), torch.device("cpu")
     )
-    body = shaped_body(fit_shape(frames.skeletons, frames.visibility))
+    body = shape_body(fit_shape(frames.skeletons, frames.visibility))
     pose = Solver(body).solve(frames.skeletons, frames.visibility)
     noise = torch.randn(
         pose.theta.shape, generator=torch.Generator().manual_seed(0)
@@ -85,7 +85,7 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     }
     landmarks = data.layout.landmarks
     p = torch.from_numpy(np.stack([landmarks.p[f] for f in (3, 4)])).float()
-    solved = Solver(shaped_body(BodyShape(**shape))).solve(p, torch.ones(2, 33))
+    solved = Solver(shape_body(BodyShape(**shape))).solve(p, torch.ones(2, 33))
     np.testing.assert_allclose(found["theta"][3:], solved.theta, atol=0.05)
     np.testing.assert_allclose(
         0.01 * found["transl"][3:], solved.transl, atol=1e-3
@@ -107,7 +107,7 @@ def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
     with np.load(tmp_path / "out" / "body_shape.npz") as shape:
         assert shape["hands"].shape == (2, 2, 3)
         assert (np.linalg.norm(shape["hands"], axis=-1) > 0).any()
-    names = shaped_body(free_space().neutral()).joint_names
+    names = shape_body(free_space().neutral()).joint_names
     fingers = [
         i
         for i, name in enumerate(names)
@@ -482,9 +482,9 @@ def test_frames_with_poses_far_from_each_other_are_used(people):
 
 def test_cameras_rotate():
     cameras = ["a", "b", "c", "d"]
-    assert rotated(cameras, None, 1) == cameras
-    assert rotated(cameras, 4, 1) == cameras
-    used = [rotated(cameras, 2, turn) for turn in range(4)]
+    assert rotate_cameras(cameras, None, 1) == cameras
+    assert rotate_cameras(cameras, 4, 1) == cameras
+    used = [rotate_cameras(cameras, 2, turn) for turn in range(4)]
     assert all(len(set(pair)) == 2 for pair in used)
     assert {camera for pair in used for camera in pair} == set(cameras)
 

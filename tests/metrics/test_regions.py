@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsgan.metrics.regions import (
-    cleared,
+    clear,
     eight_bits,
     hard_outline,
     mask_crop,
@@ -47,7 +47,7 @@ def test_what_is_8_bit_already_stays(how, dtype):
 def test_cleared_pixels_are_background():
     image = torch.full((1, 3, 2, 2), 0.5)
     keep = torch.tensor([[True, False], [False, True]]).view(1, 1, 2, 2)
-    assert cleared(image, keep, 1.0)[0, 0].tolist() == [[0.5, 1.0], [1.0, 0.5]]
+    assert clear(image, keep, 1.0)[0, 0].tolist() == [[0.5, 1.0], [1.0, 0.5]]
 
 
 def test_a_hard_outline_is_the_image_as_it_was_taken():

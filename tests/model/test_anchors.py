@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsgan.model.avatar import seen_points
+from gsgan.model.avatar import select_visible
 from gsgan.model.deformation import Deformation
 from gsgan.skeleton import Points
 
@@ -89,7 +89,7 @@ def test_each_point_has_residuals_of_its_own():
     psi = network(rest, anchors=100)
     torch.nn.init.zeros_(psi.head.weight)
     found = psi.residuals(points_of(rest), **given())
-    expected = psi._parted(psi._active(psi.table).expand(2, -1, -1))
+    expected = psi._split(psi._active(psi.table).expand(2, -1, -1))
     torch.testing.assert_close(found.sh, expected.sh)
 
 
@@ -142,13 +142,13 @@ def test_points_near_the_image_are_found(build):
     means = avatar.residuals(frame.skeleton, frame.visibility > 0, frame.body)[
         0
     ].means
-    every = seen_points(means, frame.camera, reach=10.0)
+    every = select_visible(means, frame.camera, reach=10.0)
     assert every.shape[1] == means.shape[1]
     pixels, _ = frame.camera.project(means)
-    near = seen_points(means, frame.camera, reach=0.02)
+    near = select_visible(means, frame.camera, reach=0.02)
     inside = ((pixels > 0) & (pixels < 48)).all(-1).nonzero()[:, 1]
     assert set(inside.tolist()) <= set(near[0].tolist())
     away = frame.camera.__class__(
         frame.camera.K, frame.camera.R, frame.camera.t + 100, frame.camera.size
     )
-    assert seen_points(means, away, reach=0.02).shape[1] >= 1
+    assert select_visible(means, away, reach=0.02).shape[1] >= 1

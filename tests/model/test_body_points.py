@@ -11,11 +11,11 @@ from tiny_characters import TINY
 from torch.nn import functional
 
 from gsgan.body import open_body
-from gsgan.body.lbs import stretched
+from gsgan.body.lbs import stretch_jacobian
 from gsgan.body.skinned import neighbours_on_surface, vertex_normals
 from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
-from gsgan.model.body_points import BodyPoints, moved_normals
+from gsgan.model.body_points import BodyPoints, move_normals
 from gsgan.run.runs import load_avatar
 from gsgan.scene import BodyPose
 from gsgan.synthetic.scenes import ensure_scene
@@ -185,7 +185,7 @@ def test_normals_point_out_of_the_posed_body(body):
 )
 def test_stability_normals_of_a_skin_that_is(name, A, expected):
     A = torch.tensor([[A]], requires_grad=True)
-    normal = moved_normals(A, torch.tensor([[0.0, 0.0, 1.0]]))
+    normal = move_normals(A, torch.tensor([[0.0, 0.0, 1.0]]))
     torch.testing.assert_close(
         normal[0, 0].detach(), torch.tensor(expected), atol=1e-4, rtol=0
     )
@@ -317,7 +317,7 @@ def test_normals_are_those_of_the_posed_mesh_part_by_part(
     )
     placed = BodyPoints(body, 1.7)
     points = placed(pose)
-    plain = moved_normals(points.frames, placed.rest_normals)
+    plain = move_normals(points.frames, placed.rest_normals)
     truth = torch.stack(
         [vertex_normals(means, body.faces) for means in points.means]
     )
@@ -351,7 +351,9 @@ def test_the_jacobian_is_that_of_the_learnt_weights(body):
         own = placed.gradients(
             placed.points.bone_index, placed.points.bone_weight
         )
-        wrong = stretched(points.frames, bones, placed.points.means, *own)
+        wrong = stretch_jacobian(
+            points.frames, bones, placed.points.means, *own
+        )
     a, b = body.faces[:, 0], body.faces[:, 1]
     edge = (body.vertices[b] - body.vertices[a]).float().unsqueeze(-1)
     moved = points.means[0, b] - points.means[0, a]
@@ -433,7 +435,7 @@ def test_no_gaussian_is_larger_than_two_spacings(tiny, model):
             placed = avatar.body_points.points
             psi = avatar.deformation
             psi.table[:, 7:10] = 20.0
-            raw = psi._parted(psi._active(psi.table)[None])
+            raw = psi._split(psi._active(psi.table)[None])
             gaussians = psi.compose(avatar.body_points(pose), raw, eye)
     largest = torch.linalg.eigvalsh(gaussians.covariances).amax().sqrt()
     limit = 2 * float(placed.spacing.median())
@@ -452,7 +454,7 @@ def test_no_gaussian_is_a_needle_in_200_poses_far_from_training(tiny):
     longest = []
     with torch.no_grad():
         psi.table[:, 7:10] = 20.0
-        raw = psi._parted(psi._active(psi.table)[None])
+        raw = psi._split(psi._active(psi.table)[None])
         for turns in theta:
             pose = BodyPose(turns[None], torch.zeros(1, 3))
             gaussians = psi.compose(placed(pose), raw, eye)

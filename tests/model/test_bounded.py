@@ -5,19 +5,19 @@ from test_harmonic import points_of
 
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
-from gsgan.model.residual_gaussians import bounded
+from gsgan.model.residual_gaussians import clamp_soft
 
 X = torch.tensor([-3.0, -1.0, 0.0, 1.0, 3.0])
 
 
 def slopes(grad: float) -> list[float]:
     x = X.clone().requires_grad_()
-    bounded(x, -2.0, 2.0).backward(torch.full_like(x, grad))
+    clamp_soft(x, -2.0, 2.0).backward(torch.full_like(x, grad))
     return x.grad.tolist()
 
 
 def test_values_are_a_clamps():
-    assert torch.equal(bounded(X, -2.0, 2.0), X.clamp(-2, 2))
+    assert torch.equal(clamp_soft(X, -2.0, 2.0), X.clamp(-2, 2))
 
 
 def test_beyond_a_bound_the_gradient_leads_back_and_never_further_out():

@@ -7,7 +7,7 @@ import torch
 
 from gsgan.model.harmonic import (
     Harmonic,
-    distilled,
+    distil,
     harmonics,
     ridge_regression,
 )
@@ -96,12 +96,12 @@ def test_residuals_without_the_pose_are_distilled_exactly(
         avatar.deformation.table, std=0.1
     )  # the network's are zero
     avatar = avatar.freeze() if frozen else avatar.eval()
-    found = distilled(avatar, poses_of(data))
+    found = distil(avatar, poses_of(data))
     assert isinstance(found.deformation, Harmonic)
     assert not found.deformation.coefficients.requires_grad
     ours, theirs = (x(*frame.inputs).image for x in (found, avatar))
     torch.testing.assert_close(ours, theirs.detach(), atol=2e-5, rtol=0)
-    again = distilled(found, poses_of(data))
+    again = distil(found, poses_of(data))
     assert torch.equal(
         again.deformation.coefficients, found.deformation.coefficients
     )
@@ -125,7 +125,7 @@ def test_the_regression_finds_linear_maps_and_prefers_the_mean():
 
 def test_an_avatar_without_psi_is_refused(build):
     with pytest.raises(ConfigError, match="Ψ"):
-        distilled(build("model=lbs_splat")[1], [])
+        distil(build("model=lbs_splat")[1], [])
 
 
 SMALLER = "model=harmonic size.body_points=400 size.features=1"

@@ -136,7 +136,7 @@ def test_painting_reads_nothing_back_and_copies_nothing_over(
 
     def paint():
         with torch.no_grad():
-            return avatar(*frame.inputs).pasted(window)
+            return avatar(*frame.inputs).paste(window)
 
     paint()  # constants are made once for a device
     copies.clear()

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn import functional
 
-from gsgan.model.deformation import encoded_size, positional_encoding
+from gsgan.model.deformation import encoding_size, positional_encoding
 from gsgan.model.discriminator import Discriminator
-from gsgan.model.generator import Generator, StyleModulation, upsampled_kernel
+from gsgan.model.generator import Generator, StyleModulation, upsampling_kernel
 from gsgan.model.pose_graph import PoseGraph, PoseLinear
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError
@@ -52,7 +52,7 @@ def test_the_stem_on_fine_pixels_is_the_stem_on_their_averages_and_channels(
         [F, S, p2d, functional.pixel_unshuffle(fine, times)], dim=1
     )
     plain = net.content.stem(functional.pad(content, (0, 5)))
-    quick = net._stem(net._padded(F), [S, p2d], fine)
+    quick = net._stem(net._pad(F), [S, p2d], fine)
     torch.testing.assert_close(quick, plain, atol=1e-5, rtol=1e-5)
 
 
@@ -64,7 +64,7 @@ def test_a_transposed_convolution_is_a_convolution_after_upsampling():
         padding=1,
     )
     quick = functional.conv_transpose2d(
-        h, upsampled_kernel(weight), stride=2, padding=1
+        h, upsampling_kernel(weight), stride=2, padding=1
     )
     torch.testing.assert_close(quick, plain, atol=1e-5, rtol=1e-5)
 
@@ -184,7 +184,7 @@ def test_pose_linear_has_the_papers_size():
 def test_positional_encoding_values():
     x = torch.tensor([[0.25, -0.5]])
     code = positional_encoding(x, 2)
-    assert code.shape[-1] == encoded_size(2, 2)
+    assert code.shape[-1] == encoding_size(2, 2)
     expected = torch.tensor(
         [0.25 * torch.pi, 0.5 * torch.pi, -0.5 * torch.pi, -torch.pi]
     ).sin()
@@ -200,11 +200,9 @@ def test_a_generator_of_patches(times):
     F = F if fine is None else functional.avg_pool2d(fine, times)
     assert net(F, S, p2d, g, fine).shape == (2, 4, 20, 12)
     assert len(net.up) == len(generator().up) - 1
-    given = [net._padded(x) for x in (F, S, p2d)]
+    given = [net._pad(x) for x in (F, S, p2d)]
     if fine is not None:
-        given.append(
-            functional.pixel_unshuffle(net._padded(fine, times), times)
-        )
+        given.append(functional.pixel_unshuffle(net._pad(fine, times), times))
     plain = net.content.stem(torch.cat(given, dim=1))
     torch.testing.assert_close(
         net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsgan.model.painted import painted_window
+from gsgan.model.painted import find_window
 from gsgan.scene import cat
 
 
@@ -19,7 +19,7 @@ def alpha_at(*boxes: tuple[int, int, int, int]) -> torch.Tensor:
 
 def test_boxes_hold_all_that_is_painted_and_begin_at_multiples():
     alpha = alpha_at((20, 40, 30, 50), (3, 10, 80, 96))
-    window = painted_window(alpha, margin=5, multiple=16)
+    window = find_window(alpha, margin=5, multiple=16)
     assert window.whole == (64, 96)
     # rows 0 to 45 of the first, columns 16 to 55
     assert window.size == (48, 48)
@@ -28,13 +28,13 @@ def test_boxes_hold_all_that_is_painted_and_begin_at_multiples():
 
 
 def test_an_image_without_splats_has_the_smallest_box():
-    window = painted_window(torch.zeros(1, 1, 64, 96), margin=5, multiple=16)
+    window = find_window(torch.zeros(1, 1, 64, 96), margin=5, multiple=16)
     assert window.size == (16, 16)
 
 
 def test_a_box_ends_with_its_image():
     alpha = torch.ones(1, 1, 50, 70)
-    window = painted_window(alpha, margin=8, multiple=16)
+    window = find_window(alpha, margin=8, multiple=16)
     assert window.size == (50, 70)
     assert window.corners == ((0, 0),)
 
@@ -57,7 +57,7 @@ def test_the_image_is_that_of_a_camera_that_sees_the_box(build, supersample):
         painted = avatar(*frame.inputs)
         avatar.generator_margin = None
         whole = avatar(*frame.inputs)
-        box = painted_window(
+        box = find_window(
             whole.splat_alpha, margin=8, multiple=avatar.window_multiple
         )
         seen = replace(frame, camera=box.camera(frame.camera))

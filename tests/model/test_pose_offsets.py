@@ -8,7 +8,7 @@ import torch
 from gsgan.body import open_body
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import Deformation
-from gsgan.model.harmonic import distilled
+from gsgan.model.harmonic import distil
 from gsgan.scene import BodyPose
 from gsgan.train.run import build_training
 from gsgan.utils.tensors import matvec
@@ -89,14 +89,6 @@ def test_constant_offsets_are_those_at_rest(body, placed):
     torch.testing.assert_close(found, torch.full_like(found, 0.02))
 
 
-def test_offsets_of_earlier_checkpoints_have_no_constant(placed):
-    state = placed.offsets.state_dict()
-    del state["rest"]
-    placed.offsets.rest.fill_(1)
-    placed.offsets.load_state_dict(state)
-    assert not placed.offsets.rest.any()
-
-
 @pytest.mark.parametrize("bound", [0.25, None])
 def test_residuals_with_an_offset_move_the_means_by_it(bound):
     psi = Deformation(
@@ -126,7 +118,7 @@ def test_a_page_gets_the_offsets_as_residuals(tiny):
     frame = data.dataset("train")[0]
     body = avatar.body_pose(frame.skeleton, frame.visibility)
     pose = (frame.skeleton, frame.visibility, body)
-    found = distilled(avatar, [pose], ridge=1e-12, keep_offsets=False)
+    found = distil(avatar, [pose], ridge=1e-12, keep_offsets=False)
     assert found.body_points.offsets is None
     assert avatar.body_points.offsets is not None
     eye = frame.camera.centre

@@ -192,7 +192,9 @@ def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
     body = free_body()
     hat = body.label_names.index("hair")
     bald = torch.where(body.vertex_labels == hat, 2, body.vertex_labels)
-    segmentation = Segmentation(body.voted(bald, body.label_names), points=1000)
+    segmentation = Segmentation(
+        body.with_labels(bald, body.label_names), points=1000
+    )
     assert segmentation.map.absent == ("hair",)
     with torch.no_grad():
         S = segmentation(rest_pose(), facing_camera())

@@ -7,11 +7,11 @@ from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.motion.clip import is_own
 from gsgan.motion.retarget import (
-    expressed,
     face_in_head,
-    joined,
-    retargeted,
-    steadied,
+    join,
+    retarget,
+    steady,
+    transfer_face,
 )
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import (
@@ -95,8 +95,8 @@ def driven(path, proportions, rest) -> np.ndarray:
     """``[F, 105, 3]`` the subject as `gsgan.render` drives it, in standard axes."""
     p, motion = standard(path, proportions)
     p = p if motion.detached else face_in_head(p)
-    p[:, FACE] = expressed(p[:, FACE], rest)
-    return retargeted(p, proportions)
+    p[:, FACE] = transfer_face(p[:, FACE], rest)
+    return retarget(p, proportions)
 
 
 def check(found: np.ndarray, moves: np.ndarray) -> None:
@@ -117,13 +117,13 @@ def test_a_mouth_that_opens_opens_the_subjects(
 def test_the_source_may_be_turned_and_the_heads_of_both_differ(
     talking, rest, moves
 ):
-    turned = 500 * steadied(talking[:, FACE] @ TURNED.T) + 7
-    check(expressed(turned, rest) - rest, moves)
+    turned = 500 * steady(talking[:, FACE] @ TURNED.T) + 7
+    check(transfer_face(turned, rest) - rest, moves)
 
 
 def test_another_shape_of_face_is_no_expression(talking, rest, moves):
     wide = talking[:, FACE] + 0.1 * rest[::-1] * (1, 0, 0)
-    one = expressed(wide[:1], rest)
+    one = transfer_face(wide[:1], rest)
     np.testing.assert_allclose(
         one[0], rest, atol=1e-9
     )  # a single frame is at rest
@@ -167,10 +167,10 @@ def test_missing_faces_rest_and_short_gaps_are_bridged(
 def test_next_to_no_landmarks(talking, rest, seen):
     p = talking[:, FACE].copy()
     p[4:, seen:] = np.nan
-    found = expressed(p, rest)
+    found = transfer_face(p, rest)
     assert np.isfinite(found[:4]).all()
     assert np.isnan(found[4:, seen:]).all()
-    assert np.isnan(expressed(np.full_like(p, np.nan), rest)).all()
+    assert np.isnan(transfer_face(np.full_like(p, np.nan), rest)).all()
 
 
 def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
@@ -191,10 +191,10 @@ def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
 def test_clips_with_and_without_a_face(talking, signer, rest, moves):
     p = talking.copy()
     p[:, FACE] = rest + moves[3]  # in the head's axes
-    p = retargeted(p, signer)
+    p = retarget(p, signer)
     bare = p.copy()
     bare[:, FACE] = np.nan
-    found = joined([p, p[::-1].copy(), bare], signer, 7)
+    found = join([p, p[::-1].copy(), bare], signer, 7)
     np.testing.assert_allclose(
         offsets_of(found[:31], rest), moves[[3] * 31], atol=1e-6
     )

@@ -7,7 +7,7 @@ import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.motion.clip import is_own, up_axis
-from gsgan.motion.retarget import PALM_LANDMARKS, joined, retargeted
+from gsgan.motion.retarget import PALM_LANDMARKS, join, retarget
 from gsgan.skeleton import (
     HOLISTIC,
     MEDIAPIPE33,
@@ -66,7 +66,7 @@ def write_holistic(path, p: np.ndarray):
 def driven(path, signer) -> np.ndarray:
     """``[F, J, 3]`` the signer in a .pose file's poses, in the axes of `signing`."""
     p, motion = standard(path, signer)
-    return retargeted(p @ (upright(up_axis(motion)) @ Y_DOWN), signer)
+    return retarget(p @ (upright(up_axis(motion)) @ Y_DOWN), signer)
 
 
 def test_the_figure_has_the_lengths_of_finger_bones(
@@ -141,10 +141,10 @@ def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(
 
 
 def test_clips_with_and_without_hands(signing, signer):
-    p = retargeted(signing, signer)
+    p = retarget(signing, signer)
     other = p[::-1].copy()
     other[:, LEFT] = np.nan
-    found = joined([p, other, p], signer, 7)
+    found = join([p, other, p], signer, 7)
     assert found.shape == (3 * 12 + 2 * 7, 75, 3)
     np.testing.assert_array_equal(found[19:31], other)
     between = np.r_[12:19, 31:38]
@@ -165,7 +165,7 @@ def test_landmarks_with_hands(tmp_path, signing, signer):
     assert is_own(motion, signer)
     np.testing.assert_array_equal(motion.p, signing)
     assert (
-        angles(fingers(retargeted(1.2 * p, signer)), fingers(signing)).max()
+        angles(fingers(retarget(1.2 * p, signer)), fingers(signing)).max()
         < 1e-3
     )
 
@@ -175,5 +175,5 @@ def test_a_transition_keeps_the_place_of_the_hips(signing, signer):
     far = signing[:1] + np.array([2.0, 3.0, 0.0])
     bent = far - np.array([0.0, 0.0, 0.3])
     bent[:, [25, 26], 1] -= 0.3
-    hips = joined([far, bent], signer, 6)[:, [23, 24]].mean(1)
+    hips = join([far, bent], signer, 6)[:, [23, 24]].mean(1)
     assert np.abs(hips[1:-1, :2] - hips[0, :2]).max() < 0.02

@@ -127,7 +127,7 @@ def test_cubic_splines_use_both_tangents(tmp_path):
     glb = arm_turned([0, 2], keys, "CUBICSPLINE", kind="translation")
     rig, _ = read_gltf_motion(glb.write(tmp_path / "a.glb"))
     arm = rig.names.index("mixamorig:LeftArm")
-    moved = rig.posed()[:, arm] - rig.posed()[0, arm]
+    moved = rig.pose()[:, arm] - rig.pose()[0, arm]
     np.testing.assert_allclose(moved[24], [0.05, 2 / 8 * 0.8, 0], atol=1e-6)
     np.testing.assert_allclose(moved[-1], [0.1, 0, 0], atol=1e-6)
 

@@ -12,12 +12,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils._pytree import tree_map
 
-from gsgan.body.shape import free_space, shaped_body
+from gsgan.body.shape import free_space, shape_body
 from gsgan.body.smpl import read_smpl
 from gsgan.motion.asf import asf_of, read_amc
-from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
+from gsgan.motion.clip import complete, is_own, mask_unseen, resample, up_axis
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.retarget import retargeted
+from gsgan.motion.retarget import retarget
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.proportions import BONES, measure_proportions, upright
@@ -50,8 +50,8 @@ def directions(p: np.ndarray) -> np.ndarray:
 
 def standard(path: Path, proportions, **source) -> tuple[np.ndarray, object]:
     """The file's landmarks without gaps, Z up; and the motion."""
-    motion = checked(read_motion(path, Source(proportions, **source)), 0.1)
-    return completed(motion, motion.up or up_axis(motion)), motion
+    motion = mask_unseen(read_motion(path, Source(proportions, **source)), 0.1)
+    return complete(motion, motion.up or up_axis(motion)), motion
 
 
 def write_pose(
@@ -122,7 +122,7 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
     (tmp_path / "meta.json").write_text('{"unit": "cm", "fps": 50}')
     path = tmp_path / "body_pose.npz"
     np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
-    posed = shaped_body(shape).posed_landmarks(dance).double()
+    posed = shape_body(shape).posed_landmarks(dance).double()
     own = measure_proportions(
         posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z"
     )
@@ -338,7 +338,7 @@ def test_bvh(tmp_path, proportions):
     np.testing.assert_allclose(
         directions(p @ yaw.T), directions(truth), atol=1e-4
     )
-    q = retargeted(p, proportions)
+    q = retarget(p, proportions)
     assert np.isfinite(q).all()
     path.write_text(path.read_text().replace("LeftLeg", "Tentacle"))
     with pytest.raises(DataError, match="LeftLeg"):
@@ -422,7 +422,7 @@ def test_amc(tmp_path, proportions):
     path = write_amc(tmp_path)
     bvh, metres = read_amc(path, asf_of(path))
     assert metres == pytest.approx(0.0254 / 0.45)
-    hand = bvh.posed()[:, bvh.names.index("lhand")]
+    hand = bvh.pose()[:, bvh.names.index("lhand")]
     np.testing.assert_allclose(hand[0], [3 + 5 + 4.5, 17 + 8, 0], atol=1e-9)
     # C M C⁻¹ with C a quarter turn about y: about x in the bone's axes is about -z of the parent's
     np.testing.assert_allclose(hand[1], [3 - 4.5, 17 + 8 - 5, 0], atol=1e-9)
@@ -526,12 +526,12 @@ def test_other_files(tmp_path, proportions):
 
 
 def test_frame_rates(landmarks):
-    assert len(resampled(landmarks, 120, 30)) == 3
-    np.testing.assert_allclose(resampled(landmarks, 120, 30)[1], landmarks[4])
-    half = resampled(landmarks, 30, 60)
+    assert len(resample(landmarks, 120, 30)) == 3
+    np.testing.assert_allclose(resample(landmarks, 120, 30)[1], landmarks[4])
+    half = resample(landmarks, 30, 60)
     assert len(half) == 23
     np.testing.assert_allclose(half[1], (landmarks[0] + landmarks[1]) / 2)
-    assert resampled(landmarks[:1], 24, 60).shape == (1, 33, 3)
+    assert resample(landmarks[:1], 24, 60).shape == (1, 33, 3)
 
 
 def test_frames_without_a_trunk(tmp_path, landmarks, proportions):
@@ -539,7 +539,9 @@ def test_frames_without_a_trunk(tmp_path, landmarks, proportions):
     p[0] = p[11] = p[3] = p[4, [11, 23]] = np.nan
     p[2, 12] = np.nan  # one shoulder of a neighbour
     np.savez(tmp_path / "a.npz", p=p)
-    motion = checked(read_motion(tmp_path / "a.npz", Source(proportions)), 0.1)
+    motion = mask_unseen(
+        read_motion(tmp_path / "a.npz", Source(proportions)), 0.1
+    )
     assert motion.filled == 4
     np.testing.assert_array_equal(motion.p[0], landmarks[1])
     np.testing.assert_array_equal(motion.p[11], landmarks[10])
@@ -600,7 +602,7 @@ def test_real_files(proportions):
                     standard(path, proportions)
                 continue
             p, _ = standard(path, proportions)
-            q = retargeted(p, proportions)
+            q = retarget(p, proportions)
             assert np.isfinite(q[:, :33]).all(), path
             own = torch.from_numpy(q)
             again = measure_proportions(

@@ -10,7 +10,7 @@ from test_motion_readers import directions, standard
 from gsgan.motion.bvh import read_bvh
 from gsgan.motion.clip import frame_times, usual_rate
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.standard import known_joints
+from gsgan.motion.standard import find_joints
 from gsgan.skeleton.proportions import BONES
 from gsgan.utils.errors import DataError
 
@@ -93,7 +93,7 @@ def test_positions_are_counted_from_the_offset_or_the_parent(tmp_path, chest):
     motion = read_bvh(written(tmp_path, BVH.replace("{chest}", chest)))
     assert motion.local is None
     np.testing.assert_allclose(
-        motion.posed()[:, 1], [[0, 100, 0], [0, 101, 0]], atol=1e-4
+        motion.pose()[:, 1], [[0, 100, 0], [0, 101, 0]], atol=1e-4
     )
 
 
@@ -102,7 +102,7 @@ def test_bones_that_do_stretch_keep_their_channels(tmp_path, chest):
     motion = read_bvh(written(tmp_path, BVH.replace("{chest}", chest)))
     assert motion.local is not None
     given = [float(word) for word in chest.split()]
-    np.testing.assert_allclose(motion.posed()[0, 1], np.add(given, [0, 90, 0]))
+    np.testing.assert_allclose(motion.pose()[0, 1], np.add(given, [0, 90, 0]))
 
 
 @pytest.mark.parametrize(
@@ -178,12 +178,12 @@ LIMB = ["UpLeg", "Leg", "Foot", "ToeBase", "Arm", "ForeArm", "Hand"]
 
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
 def test_joints_of_common_exporters_are_known(names):
-    known = known_joints(tuple(names.split()))
+    known = find_joints(tuple(names.split()))
     assert known == {f"Left{bone}": place for place, bone in enumerate(LIMB)}
 
 
 def test_daz_fingers_and_twists():
-    known = known_joints(
+    known = find_joints(
         ("lMid1", "lMid2", "lPinky1", "lThumb1", "lForearmTwist", "lThighTwist")
     )
     assert known == {

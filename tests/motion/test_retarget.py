@@ -5,7 +5,7 @@ import pytest
 import torch
 from test_motion_readers import directions
 
-from gsgan.motion.retarget import heading, joined, placed, retargeted
+from gsgan.motion.retarget import heading, join, place, retarget
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.proportions import (
@@ -35,7 +35,7 @@ def stretched(p: np.ndarray) -> np.ndarray:
 def test_a_person_is_put_on_its_own_bones_unchanged(landmarks, proportions):
     """But for hands, feet and face, which are rigid, and what medians leave."""
     body = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
-    q = retargeted(landmarks, proportions)
+    q = retarget(landmarks, proportions)
     np.testing.assert_allclose(q[:, body], landmarks[:, body], atol=0.05)
     np.testing.assert_allclose(q, landmarks, atol=0.1)
 
@@ -43,7 +43,7 @@ def test_a_person_is_put_on_its_own_bones_unchanged(landmarks, proportions):
 def test_another_person_keeps_directions_and_gets_the_lengths(
     landmarks, proportions
 ):
-    q = retargeted(stretched(landmarks), proportions)
+    q = retarget(stretched(landmarks), proportions)
     np.testing.assert_allclose(directions(q), directions(landmarks), atol=1e-9)
     for bone in BONES:
         lengths = np.linalg.norm(q[:, bone[1]] - q[:, bone[0]], axis=-1)
@@ -70,14 +70,14 @@ def test_an_empty_clip_is_not_joined(proportions, empty):
     clips = [proportions.rest[None], proportions.rest[None]]
     clips[empty] = clips[empty][:0]
     with pytest.raises(ValueError, match=f"clip {empty} "):
-        joined(clips, proportions, 7)
+        join(clips, proportions, 7)
 
 
 def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):
     step = np.array([0.01, 0, 0])
     p = np.stack([proportions.rest + i * step for i in range(4)])
     q = p[::-1] + 50 * step
-    found = joined([p, q, p], proportions, 7)
+    found = join([p, q, p], proportions, 7)
     assert len(found) == 3 * 4 + 2 * 7
     assert np.array_equal(found[:4], p)
     assert np.array_equal(found[11:15], q)
@@ -125,13 +125,13 @@ def test_feet_on_the_ground_and_a_walker_on_a_treadmill(proportions):
     walk[..., 2] += np.linspace(0, 0.5, 90)[:, None]  # uphill
     walk = walk @ rotation(np.array([0, 0, 2.0])).T
     centre = np.array([1.0, 2.0, 3.0])
-    on = placed(walk, proportions, centre, 30, ground=True, stay=True)
+    on = place(walk, proportions, centre, 30, ground=True, stay=True)
     assert heading(on[0]) == pytest.approx(proportions.facing)
     np.testing.assert_allclose(
         on[:, HEELS_AND_TOES, 2].min(1), proportions.ground, atol=0.07
     )
     assert np.abs(middle(on, HIPS)[:, :2] - centre[:2]).max() < 0.3
-    free = placed(walk, proportions, centre, 30, ground=False, stay=False)
+    free = place(walk, proportions, centre, 30, ground=False, stay=False)
     np.testing.assert_allclose(middle(free, HIPS)[0, :2], centre[:2], atol=1e-9)
     assert np.linalg.norm(
         np.ptp(middle(free, HIPS)[:, :2], axis=0)

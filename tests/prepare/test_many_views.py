@@ -13,7 +13,7 @@ from gsgan.prepare.triangulate import robust
 def solved(noise: float, p: np.ndarray, weight: np.ndarray | None = None):
     """Joints by triangulation and by the body, ``[F, 33, 3]`` metres."""
     rig, _, uv, conf = seen(ring(), p=p, noise=noise)
-    rig, uv = rig.normalised(uv)
+    rig, uv = rig.normalise(uv)
     conf = conf if weight is None else conf * weight
     flat = robust(rig, uv.reshape(4, -1, 2), conf.reshape(4, -1))
     points = flat.p.reshape(p.shape)

@@ -80,7 +80,7 @@ def dense_step(
     stop, amount = below_minimum(at.q, solver.minimum)
 
     def landmarks(dq: torch.Tensor, shared: torch.Tensor) -> torch.Tensor:
-        body = problem.space.shaped(shape_of(problem.space, shared[PLANE:]))
+        body = problem.space.body_of(shape_of(problem.space, shared[PLANE:]))
         transforms = solver.transforms(at.q + dq, at.root, body.joints)
         return solver.points(transforms, body.landmarks.nan_to_num())
 

@@ -21,9 +21,10 @@ from gsgan.prepare.clocks import (
     unsteady_clocks,
 )
 from gsgan.prepare.frames import sample
-from gsgan.prepare.run import late_clocks, prepare
+from gsgan.prepare.run import prepare
 from gsgan.prepare.sources import recording_notes, video_recording
 from gsgan.prepare.stages import StageFolder
+from gsgan.prepare.summary import late_clocks
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json
 

@@ -240,7 +240,7 @@ def biased_scene(frames: int = 30):
 
 
 def found_by(given, uv, conf, silhouettes):
-    cameras, scaled = given.normalised(uv)
+    cameras, scaled = given.normalise(uv)
     time = np.arange(conf.shape[1]) / 30
     corrected = correct(cameras, scaled, conf, time)
     return refine(given, corrected, silhouettes, SolveSettings())

@@ -25,7 +25,7 @@ def test_a_jog_at_five_frames_a_second_keeps_its_sides():
     with np.load(Path(__file__).with_name("jog.npz")) as arrays:
         jog = {name: arrays[name].astype(np.float64) for name in arrays}
     cameras = CameraArray(jog["K"], jog["R"], jog["t"])
-    cameras, uv = cameras.normalised(jog["px"])
+    cameras, uv = cameras.normalise(jog["px"])
     flips = find_flips(cameras, uv, jog["conf"], np.arange(15) / 5)
     sided = apply_flips(uv, flips, FLIP_GROUPS).reshape(6, -1, 2)
     weight = apply_flips(jog["conf"], flips, FLIP_GROUPS).reshape(6, -1)

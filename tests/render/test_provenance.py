@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsgan.render.output import encoded
+from gsgan.render.output import encode_video
 from gsgan.utils.errors import DataError
 from gsgan.utils.provenance import (
     SOURCE_TYPE,
-    marked_mp4,
+    mark_mp4,
     png_bytes,
     verify,
 )
@@ -29,7 +29,7 @@ def png(tmp_path):
 def mp4(tmp_path):
     pytest.importorskip("av")
     path = tmp_path / "a.mp4"
-    path.write_bytes(marked_mp4(encoded(iter([PIXELS] * 3), 30)))
+    path.write_bytes(mark_mp4(encode_video(iter([PIXELS] * 3), 30)))
     return path
 
 

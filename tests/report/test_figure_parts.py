@@ -12,7 +12,7 @@ from gsgan.report.figures.layout import (
     TALLEST,
     Panel,
     draw_panels,
-    written,
+    format_number,
 )
 from gsgan.report.figures.run import most_disputed
 from gsgan.report.figures.subjects import choose_items, make_shots, measure
@@ -39,7 +39,7 @@ def test_measures_in_closed_form():
     assert same["psnr"] is None  # infinite
     blank = measure(truth, torch.zeros_like(truth))
     assert blank["edge_f1"] is None
-    assert written(None, 2, " dB") == "n/a"
+    assert format_number(None, 2, " dB") == "n/a"
 
 
 def test_the_box_lies_where_the_runs_differ():

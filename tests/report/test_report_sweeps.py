@@ -36,21 +36,6 @@ def test_values_of_a_setting_are_rows_in_their_order(tmp_path):
     assert texts(row(grid, "full, adversarial 2"))[0] == "32.50 ± 0.71"
 
 
-def test_a_setting_of_an_earlier_version_has_its_present_name(tmp_path):
-    runs = []
-    for i, key in enumerate(("most", "max_restorations")):
-        run = write_run(tmp_path / key, "full", i, psnr=30.0)
-        (run / ".hydra").mkdir()
-        config = {"training": {"rollback": {key: 3}}}
-        (run / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
-        runs.append(run)
-    (grid,) = report_of(
-        table(by=["training.rollback.max_restorations"]), *runs
-    ).grids
-    labels = [r.label for r in grid.rows if r.kind == "run"]
-    assert labels == ["full, max restorations 3"]
-
-
 def test_without_it_they_are_refused_and_so_is_any_other_difference(tmp_path):
     runs = [swept(tmp_path, weight, 0, 30.0) for weight in (0.0, 0.5)]
     with pytest.raises(ConfigError, match="seed"):

@@ -16,7 +16,7 @@ from report_folders import (
     zju,
 )
 
-from gsgan.report.spec import written
+from gsgan.report.spec import format_value
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError
 
@@ -404,7 +404,7 @@ def test_a_mean_over_subjects_refuses_other_protocols(tmp_path):
     [(1.006, "1.01"), (-1.5, "−1.50"), (-0.001, "0.00"), (2.0, "2.00")],
 )
 def test_signs_and_digits(value, text):
-    assert written("psnr", value) == text
+    assert format_value("psnr", value) == text
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.model.generator import Generator
 from gsgan.run.assemble import build_avatar
 from gsgan.train.description import describe
-from gsgan.train.module import fitted_schedule
+from gsgan.train.module import fit_schedule
 from gsgan.train.run import build_training
 from gsgan.utils.config import config_folder
 
@@ -60,7 +60,7 @@ def test_full_is_full_at_every_size_and_on_all_data(compose, size):
 def test_full_has_a_second_step_on_all_data(compose, data):
     config = compose("train", f"data={data}")
     schedule = instantiate(config.training.schedule)
-    assert fitted_schedule(schedule, built(config)).step_two > 0
+    assert fit_schedule(schedule, built(config)).step_two > 0
 
 
 @pytest.mark.parametrize("model", ["wo_seg", "wo_gcn", "wo_feat"])

@@ -16,7 +16,7 @@ from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
 from gsgan.model.body_points import neighbour_distance
 from gsgan.run.assemble import build_avatar, build_data
-from gsgan.run.class_vote import class_vote, seen
+from gsgan.run.class_vote import class_vote, find_visible
 from gsgan.run.runs import load_avatar
 from gsgan.scene import BodyPose, Camera, Frame
 from gsgan.train.run import build_training
@@ -71,7 +71,7 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
     beside = torch.tensor([[0.7, 0.0, 2.3]])
     close = plate(2.01, half=0.1)  # within the tolerance
     points = torch.cat([front, behind, beside, close])
-    shown = seen(
+    shown = find_visible(
         points, neighbour_distance(points, 4), camera(), tolerance=0.03
     )
     front_seen, behind_seen, beside_seen, close_seen = shown.split(
@@ -106,10 +106,12 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
 )
 def test_odd_points_are_not_seen_and_hide_nothing(odd):
     points = torch.cat([plate(2.0), torch.tensor(odd)])
-    shown = seen(points, torch.full((len(points),), 0.05), camera(), 0.03)
+    shown = find_visible(
+        points, torch.full((len(points),), 0.05), camera(), 0.03
+    )
     assert shown[:-1].all()
     assert not shown[-1]
-    assert not seen(
+    assert not find_visible(
         torch.tensor(odd), torch.tensor([0.05]), camera(), 0.03
     ).any()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.run.drive import Drive, smoothed
+from gsgan.run.drive import Drive, smooth
 from gsgan.scene import BodyPose
 
 
@@ -20,14 +20,14 @@ def drive() -> Drive:
 
 def test_it_is_off_by_default(compose, drive):
     for command in ("render", "view"):
-        assert smoothed(compose(command, "run=x").smooth, drive, 30.0) is drive
+        assert smooth(compose(command, "run=x").smooth, drive, 30.0) is drive
 
 
 @pytest.mark.parametrize("command", ["render", "view"])
 def test_body_poses_follow_the_joints_and_gaps_start_anew(
     compose, drive, command
 ):
-    found = smoothed(
+    found = smooth(
         compose(command, "run=x", "smooth.enabled=true").smooth, drive, 30.0
     )
     assert found.body is None

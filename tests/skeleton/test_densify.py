@@ -12,7 +12,12 @@ from skeleton_poses import REST, noisy, rest, rotation
 from torch import Tensor
 
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
-from gsgan.skeleton.densify import even_box, even_cylinder, even_sphere, shipped
+from gsgan.skeleton.densify import (
+    even_box,
+    even_cylinder,
+    even_sphere,
+    load_samples,
+)
 from gsgan.utils.errors import ConfigError
 
 F64 = torch.float64
@@ -275,7 +280,7 @@ def test_shipped_templates_can_be_made_again():
         ("box", 500),
         ("box_fit", 500),
     ):
-        points, normals = shipped(shape, n)
+        points, normals = load_samples(shape, n)
         np.testing.assert_allclose(points, made[shape], atol=1e-6)
         np.testing.assert_allclose(normals, made[f"{shape}_normals"], atol=1e-6)
 

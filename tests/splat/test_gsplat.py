@@ -134,7 +134,7 @@ def install(monkeypatch, module, device="cpu"):
     monkeypatch.setitem(sys.modules, "gsplat", module)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(gsplat_backend, "DEVICE", device)
-    gsplat_backend._measured_cap.cache_clear()
+    gsplat_backend._measure_cap.cache_clear()
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def mock(monkeypatch):
     module = StandIn()
     install(monkeypatch, module)
     yield module
-    gsplat_backend._measured_cap.cache_clear()
+    gsplat_backend._measure_cap.cache_clear()
 
 
 def scene(
@@ -437,7 +437,7 @@ def test_the_package_draws_the_same_as_torch(shape, antialias):
     gaussians, cam = (x.to(CUDA) for x in scene(shape))
     # Faint, so that no pixel stops: there gsplat differs.
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.3)
-    cap, problem = gsplat_backend._measured_cap(gaussians.means.device)
+    cap, problem = gsplat_backend._measure_cap(gaussians.means.device)
     assert cap is not None, problem
     settings = replace(STANDARD, alpha_max=cap, antialias=antialias)
     assert (
@@ -478,4 +478,4 @@ def test_a_newer_version_draws_too(monkeypatch):
         gaussians, cam, settings=settings, backend="torch"
     ).features
     assert error(got, want) < 1e-4
-    gsplat_backend._measured_cap.cache_clear()
+    gsplat_backend._measure_cap.cache_clear()

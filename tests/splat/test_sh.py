@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.splat.sh import brightened, sh_basis, sh_to_colour
+from gsgan.splat.sh import brighten, sh_basis, sh_to_colour
 
 
 def sphere(n: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
@@ -109,6 +109,6 @@ def test_brightened_harmonics_give_colours_times_a_factor(degree):
     view = torch.randn(2, 5, 3, generator=generator)
     factor = torch.rand(2, 5, 1, generator=generator)
     torch.testing.assert_close(
-        sh_to_colour(brightened(sh, factor), view),
+        sh_to_colour(brighten(sh, factor), view),
         factor * sh_to_colour(sh, view),
     )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gsgan.splat import ACCURACY, project, rasterise
 from gsgan.splat.project import rotations
-from gsgan.splat.reference import _alphas, _pixel_chunks, _sorted
+from gsgan.splat.reference import _alphas, _pixel_chunks, _sort
 from stability.cases.case import (
     Inputs,
     Tolerance,
@@ -198,7 +198,7 @@ def error_bound(projected, size, accuracy):
     A layer that is skipped changes a pixel by at most its own weight, a capped alpha by at most the
     weight that the cap removes; a stopped pixel lacks less than ``transmittance_min``.
     """
-    front_to_back = _sorted(projected)
+    front_to_back = _sort(projected)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
         whole = _alphas(front_to_back, pixels, ACCURACY["exact"])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import between, rotation
-from gsgan.motion.standard import known_joints
+from gsgan.motion.standard import find_joints
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 X_FORWARD = np.array(
@@ -174,7 +174,7 @@ class Bones:
 def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
     """An AMC motion with Mixamo's bone names, Z up; each ``every``-th frame."""
     rig, metres = read_amc(path, asf_of(path))
-    known = {j: bone for bone, j in known_joints(rig.names).items()}
+    known = {j: bone for bone, j in find_joints(rig.names).items()}
 
     def bone(j: int) -> str:
         name, side = (
@@ -200,7 +200,7 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
     B = Y_UP.T
     moved = Animation(
         B @ rig.rotations[::every][:, kept] @ B.T,
-        metres * rig.posed()[::every][:, kept] @ B.T,
+        metres * rig.pose()[::every][:, kept] @ B.T,
         {},
         (),
     )

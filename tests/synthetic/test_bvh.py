@@ -10,7 +10,7 @@ from mannequin import choreography, mannequin
 from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
 from gsgan.motion.rotations import axis_angle, rotation
-from gsgan.motion.standard import ROOM, known_joints
+from gsgan.motion.standard import ROOM, find_joints
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.utils.errors import DataError
 
@@ -123,13 +123,13 @@ def test_every_style_of_names_is_known():
                     3: f"{stem}_{letter.lower()}",
                     4: f"{side.lower()}_{stem}",
                 }[style]
-                assert known_joints((written,)) == {side + bone: 0}, written
-    assert known_joints(("hip", "Head", "LHipJoint", "__UpLeg_L")) == {
+                assert find_joints((written,)) == {side + bone: 0}, written
+    assert find_joints(("hip", "Head", "LHipJoint", "__UpLeg_L")) == {
         "Hips": 0,
         "Head": 1,
     }
-    assert known_joints(("LeftShoulder", "LeftArm")) == {"LeftArm": 1}
-    assert known_joints(("index_02_l", "LThumb")) == {
+    assert find_joints(("LeftShoulder", "LeftArm")) == {"LeftArm": 1}
+    assert find_joints(("index_02_l", "LThumb")) == {
         "LeftHandIndex2": 0,
         "LeftHandThumb1": 1,
     }
@@ -188,7 +188,7 @@ def test_feet_are_put_on_the_floor(tmp_path, person, signing):
     path = write_bvh(tmp_path / "a.bvh", person, raised, STEP)
     motion = RecordedMotion(person, path).at(np.linspace(0, 2, 100))
     for R, joints in zip(motion.rotations, motion.joints, strict=True):
-        assert -0.005 < person.skinned(R, joints)[0][:, 2].min() < 0.005
+        assert -0.005 < person.skin(R, joints)[0][:, 2].min() < 0.005
     foot = motion.joints[:, person.bones.index("LeftToeBase"), :2]
     assert np.ptp(foot, axis=0).max() < 0.01
 

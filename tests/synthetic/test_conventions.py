@@ -140,7 +140,7 @@ def draw(person, acted, tmp_path_factory):
             np.array([20.0, 50.0]) * STEP
         )
         pairs = zip(poses.rotations, poses.joints, strict=True)
-        skinned = [character.skinned(*pose) for pose in pairs]
+        skinned = [character.skin(*pose) for pose in pairs]
         view = from_front(64, focal=80, height=0.9)
         return np.stack(
             [

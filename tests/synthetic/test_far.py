@@ -64,7 +64,7 @@ def test_joints_stay_within_their_limits(moves):
 def test_the_person_is_on_the_floor_and_not_in_it(polo, moves):
     times, motion = moves
     for f in range(0, len(times), 7):
-        low = polo.skinned(motion.rotations[f], motion.joints[f])[0][:, 2].min()
+        low = polo.skin(motion.rotations[f], motion.joints[f])[0][:, 2].min()
         assert low > -0.025, motion.passages[f]
         assert low < 0.1 or motion.passages[f] == "climb"
 

@@ -16,7 +16,7 @@ from tiny_glb import BONES, TinyGlb
 from gsgan.body.free import free_body
 from gsgan.motion.gltf_file import DRACO, GltfFile
 from gsgan.motion.humanoid import mixamo_bone, vrm_bone
-from gsgan.motion.standard import known_joints
+from gsgan.motion.standard import find_joints
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
 from gsgan.synthetic.textures import linear, srgb
@@ -289,7 +289,7 @@ def test_names_of_motions_are_those_of_characters(
         names = {
             bone: f"{name}_0{k}" for k, (bone, name) in enumerate(names.items())
         }
-    known = known_joints(tuple(names.values()))
+    known = find_joints(tuple(names.values()))
     limbs = {bone for bone in BONES if bone not in ("Spine", "Neck")}
     assert {list(names)[place]: bone for bone, place in known.items()} == {
         bone: bone for bone in limbs
@@ -301,11 +301,11 @@ def test_names_of_motions_are_those_of_characters(
 
 def test_further_segments_meshes_and_fingers_are_no_limbs(tmp_path, tiny):
     """Blender writes children first: the second half of an arm comes before the first one."""
-    assert known_joints(("DEF-thigh.L.001", "DEF-thigh.L")) == {"LeftUpLeg": 1}
+    assert find_joints(("DEF-thigh.L.001", "DEF-thigh.L")) == {"LeftUpLeg": 1}
     fingers = ("Bip001 L Finger0", "Bip001 L Finger11", "Bip001 L Finger0Nub")
-    assert known_joints(fingers) == {"LeftHandThumb1": 0, "LeftHandIndex2": 1}
+    assert find_joints(fingers) == {"LeftHandThumb1": 0, "LeftHandIndex2": 1}
     unreal = ("index_metacarpal_l", "index_01_l", "upperarm_twist_01_l")
-    assert known_joints(unreal) == {"LeftHandIndex1": 1}
+    assert find_joints(unreal) == {"LeftHandIndex1": 1}
     glb = TinyGlb(names=UNREAL)
     glb.doc.nodes[-1].name = "head"
     glb.doc.nodes.insert(0, glb.doc.nodes.pop())

@@ -86,7 +86,7 @@ class Swing:
 def frame(c, secondary, motion, time):
     """Skinned vertices and normals, and what becomes of them."""
     pose = motion.at(np.array([time]))
-    X, N = c.skinned(pose.rotations[0], pose.joints[0])
+    X, N = c.skin(pose.rotations[0], pose.joints[0])
     return X, N, *secondary(time, pose.rotations[0], X, N)
 
 

@@ -109,7 +109,7 @@ def test_hands_touch_and_do_not_pass_through_each_other(polo, take):
     for name, R, joints in zip(
         TOGETHER, moves.rotations, moves.joints, strict=True
     ):
-        vertices, _ = polo.skinned(R, joints)
+        vertices, _ = polo.skin(R, joints)
         left, right = (vertices[arm] for arm in arms)
         near = cKDTree(left).query(right)[0].min()
         assert near < TOGETHER[name][1], name

@@ -150,7 +150,7 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
         "left_foot_index": "shoe",
         "right_heel": "shoe",
     }
-    labels = scene.posed(1).render(scene.views["cam00"], 4)[
+    labels = scene.pose(1).render(scene.views["cam00"], 4)[
         2
     ]  # from before the person
     for name, part in expected.items():

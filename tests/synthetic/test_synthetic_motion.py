@@ -17,7 +17,7 @@ from mannequin import (
 from gsgan.motion.rig import SIDES, Pose, Rig
 from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.synthetic.free_subject import free_character
-from gsgan.synthetic.passages import COMBINATION, frame_times, held_out
+from gsgan.synthetic.passages import COMBINATION, choose_held_out, frame_times
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.takes import MOTIONS
 
@@ -138,7 +138,7 @@ def test_soles_stay_on_the_floor(person, free):
         source = choreography(body)
         moves = source.at(frame_times(frames, source.duration))
         for R, joints in zip(moves.rotations, moves.joints, strict=True):
-            assert -0.005 < body.skinned(R, joints)[0][:, 2].min() < 0.015
+            assert -0.005 < body.skin(R, joints)[0][:, 2].min() < 0.015
 
 
 def arms_in_trunk(body, moves) -> np.ndarray:
@@ -161,7 +161,7 @@ def arms_in_trunk(body, moves) -> np.ndarray:
     )
     shares = []
     for R, joints in zip(moves.rotations, moves.joints, strict=True):
-        vertices, _ = body.skinned(R, joints)
+        vertices, _ = body.skin(R, joints)
         shares.append(inside(vertices[arms], vertices, trunk).mean())
     return np.array(shares)
 
@@ -189,9 +189,7 @@ def test_rest_poses_do_not_matter(person):
     source = choreography(person)
     # arms down, knees bent
     standing = source.at(np.array([source.duration]))
-    vertices, normals = person.skinned(
-        standing.rotations[0], standing.joints[0]
-    )
+    vertices, normals = person.skin(standing.rotations[0], standing.joints[0])
     down = replace(
         person, vertices=vertices, normals=normals, joints=standing.joints[0]
     )
@@ -283,7 +281,7 @@ def test_held_out_frames_are_blocks_and_one_whole_passage(passages):
     words = PASSAGES.split()
     counts = zip(words[::2], map(int, words[1::2]), strict=True)
     assert list(names) == [name for name, n in counts for _ in range(n)]
-    test = held_out(names, 21)
+    test = choose_held_out(names, 21)
     assert test == HELD
     combination = [i for i, n in enumerate(names) if n == COMBINATION]
     assert set(combination) <= set(test)
@@ -299,6 +297,6 @@ def test_held_out_frames_are_blocks_and_one_whole_passage(passages):
 def test_held_out_count_is_exact(frames, passages):
     names = passages(frames)
     for count in range(frames):
-        test = held_out(names, count)
+        test = choose_held_out(names, count)
         assert len(set(test)) == count
         assert set(test) < set(range(frames))

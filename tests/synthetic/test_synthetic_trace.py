@@ -306,7 +306,11 @@ def test_masks_and_labels_agree_with_a_z_buffer(view):
 @pytest.mark.parametrize(
     ("where", "name", "value"),
     [
-        (PosedCharacter, "_touched", lambda self, v: np.ones(v.size, bool)),
+        (
+            PosedCharacter,
+            "_find_touched",
+            lambda self, v: np.ones(v.size, bool),
+        ),
         (trace, "BLOCK_RAYS", 100),
     ],
 )

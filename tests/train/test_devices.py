@@ -23,7 +23,7 @@ from gsgan.train.module import AvatarTraining
 from gsgan.train.optimisers import parameter_groups
 from gsgan.utils import tensors
 from gsgan.utils.records import TensorRecord
-from gsgan.view.session import layers, shown
+from gsgan.view.session import layers, show_layer
 
 REAL = os.environ.get("GPU_CHECK_DEVICE", "cuda")
 CACHES = (tensors._constant, skeleton_tensors.constants, draw._segment_ends)
@@ -59,7 +59,7 @@ def place(request, monkeypatch):
             gsplat_backend, "why_not", lambda settings, device: ""
         )
         monkeypatch.setattr(
-            gsplat_backend, "given_up", lambda settings, device: ""
+            gsplat_backend, "describe_limits", lambda settings, device: ""
         )
         monkeypatch.setattr(gsplat_backend, "draw", drawn)
         # knows no meta
@@ -173,7 +173,7 @@ def test_layers_and_export(start, place):
         rendering = avatar(*frame.inputs)
         behind = torch.zeros(3, 1, 1)
         for layer in layers(avatar):
-            image = shown(layer, rendering, behind)
+            image = show_layer(layer, rendering, behind)
             assert image.shape == (*truth.camera.size, 3)
         splats = splats_of(
             avatar, frame.skeleton, frame.visibility > 0, frame.body

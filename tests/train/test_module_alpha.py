@@ -9,6 +9,22 @@ import torch
 from gsgan.model.rendering import Rendering
 from gsgan.train.losses import StepOneLoss, StepTwoLoss
 
+STEP_ONE = {
+    "l1": 0.8,
+    "ssim": 0.2,
+    "feature_head": 0.5,
+    "perceptual": 0.0,
+    "perceptual_from": 0.3,
+}
+NETWORKS = {
+    "perceptual": 1.0,
+    "perceptual_every": 1,
+    "adversarial": 1.0,
+    "feature_matching": 10.0,
+    "gan": "logistic",
+    "anchor": 1.0,
+}
+
 
 def leaves(*channels: int, size: int = 16) -> list[torch.Tensor]:
     """Random pictures that take a gradient."""
@@ -31,7 +47,7 @@ def seen_person(size: int = 16) -> SimpleNamespace:
 def test_step_two_compares_on_white_by_alpha_and_mask():
     image, alpha = leaves(3, 1)
     frame = seen_person()
-    weights = StepTwoLoss(l1=0.5, l2=3.0, ssim=0.0, alpha=2.0)
+    weights = StepTwoLoss(l1=0.5, l2=3.0, ssim=0.0, alpha=2.0, **NETWORKS)
 
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
         painting = Rendering(image, alpha)
@@ -98,7 +114,9 @@ def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
         torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1),
     )
     painting = Rendering(None, features=features, splat_alpha=alpha)
-    with_alpha, without = StepOneLoss(alpha=0.3), StepOneLoss(alpha=0.0)
+    with_alpha, without = (
+        StepOneLoss(alpha=weight, **STEP_ONE) for weight in (0.3, 0.0)
+    )
     on_black = with_alpha(painting, frame, None, None)
     (slope,) = torch.autograd.grad(on_black, alpha)
     off = (alpha - frame.mask).detach() * (frame.unsure == 0)

@@ -22,8 +22,8 @@ from gsgan.train.registration import (
     TrainingView,
     flow_between,
     linear_fit,
-    projected_slope,
-    sampled,
+    projection_slope,
+    sample_image,
 )
 from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
@@ -138,14 +138,14 @@ def avatar_of(placed) -> SimpleNamespace:
 def found(painted):
     """The offsets of each frame, before any is explained by the pose."""
     surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
-    return surface.registered(range(4), Console(quiet=True))
+    return surface.align_frames(range(4), Console(quiet=True))
 
 
 def test_the_surface_of_each_frame_is_found(painted, found):
     assert found.isfinite().all()
 
     def apart(offsets):
-        at = painted.placed.points.learnt.interpolated
+        at = painted.placed.points.learnt.interpolate
         return torch.stack([at(x - offsets[0]) for x in offsets])
 
     truth = apart(painted.offsets)
@@ -161,7 +161,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
         torch.zeros_like(painted.offsets),
     )
     surface = MovingSurface(avatar_of(painted.placed), still, Registration())
-    found = surface.registered(range(4), Console(quiet=True))
+    found = surface.align_frames(range(4), Console(quiet=True))
     # a third of a pixel
     assert found.norm(dim=2).median() < 0.0035
 
@@ -173,7 +173,7 @@ def test_what_the_pose_explains_starts_the_offsets(painted, found):
         for frame, pose in enumerate(painted.poses):
             rest = registered.of(torch.tensor([frame]))
             explained = placed.offset(replace(pose, offsets=rest))[0]
-            expected = placed.points.learnt.interpolated(found[frame])
+            expected = placed.points.learnt.interpolate(found[frame])
             torch.testing.assert_close(explained, expected, atol=1e-4, rtol=0)
 
 
@@ -229,7 +229,7 @@ def test_flat_images_are_not_trusted():
 def test_sampling_counts_from_pixel_centres_for_any_number_of_points():
     image = np.arange(12, dtype=np.float32).reshape(3, 4)
     pixels = np.tile(np.float32([[2.5, 1.5], [1.0, 0.5]]), (20_000, 1))
-    found = sampled(image, pixels)
+    found = sample_image(image, pixels)
     assert found.shape == (40_000,)
     assert np.allclose(found, np.tile([6.0, 0.5], 20_000))
 
@@ -237,7 +237,7 @@ def test_sampling_counts_from_pixel_centres_for_any_number_of_points():
 def test_slopes_are_those_of_the_projection():
     view = camera(0.7)
     means = 0.3 * torch.randn(5, 3) + torch.tensor([0.0, 0.0, 0.9])
-    slope = projected_slope(view, means)
+    slope = projection_slope(view, means)
     exact = torch.autograd.functional.jacobian(
         lambda x: view.project(x[None])[0][0], means
     )

@@ -103,7 +103,7 @@ def test_f_is_supersampled_after_the_coarse_iterations_of_step_one():
     schedule = Schedule(
         segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5
     )
-    fitted = schedule.fitted(segmentation=True, splats=True, generator=True)
+    fitted = schedule.fit_parts(segmentation=True, splats=True, generator=True)
     assert [fitted.fine(step) for step in (9, 10, 19, 20, 25, 39)] == [
         True,
         False,

@@ -59,7 +59,7 @@ def test_every_phase_trains_on_parts(make, margin):
 
 def test_the_same_iteration_sees_the_same_part(make):
     module, _, data = make("training.window=16", "size.image=48")
-    frame = next(iter(data.train_dataloader())).unpacked()
+    frame = next(iter(data.train_dataloader())).unpack()
     module.step = 3
     first = module._cut(frame)
     assert torch.equal(first.image, module._cut(frame).image)
@@ -85,7 +85,7 @@ def test_gradients_of_a_part_are_those_of_its_pixels_in_the_whole_image(
         "size.supersample=2",
     )
     avatar = module.avatar.train()
-    frame = next(iter(data.train_dataloader())).unpacked()
+    frame = next(iter(data.train_dataloader())).unpack()
     whole = Window(
         corners=((0, 0),) * len(frame), size=(48, 48), whole=(48, 48)
     )

@@ -11,7 +11,7 @@ from gsgan.utils.config import (
     PATHS,
     config_folder,
     paths_as_text,
-    quoted,
+    quote,
 )
 
 ODD = (
@@ -53,7 +53,7 @@ TEXT = (
 def parsed(argument: str) -> object:
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    return OverridesParser.create().parse_override(quoted(argument)).value()
+    return OverridesParser.create().parse_override(quote(argument)).value()
 
 
 @pytest.mark.parametrize("path", ODD)
@@ -72,8 +72,8 @@ def test_a_list_of_odd_paths_arrives_as_typed():
 
 
 def test_commas_part_the_values_of_a_sweep():
-    assert quoted("run=377,378", sweep=True) == "run=377,378"
-    assert quoted("run=377", sweep=True) == "run='377'"
+    assert quote("run=377,378", sweep=True) == "run=377,378"
+    assert quote("run=377", sweep=True) == "run='377'"
 
 
 def test_numbers_of_config_files_become_text():
@@ -119,7 +119,7 @@ def test_the_users_folder_is_expanded(monkeypatch):
     ],
 )
 def test_what_hydra_reads_stays(argument, value):
-    assert quoted(argument) == argument
+    assert quote(argument) == argument
     found = parsed(argument)
     assert OmegaConf.create({"v": found}).v == value or str(found) == value
 
@@ -128,7 +128,7 @@ def test_what_hydra_reads_stays(argument, value):
     "argument", ["--help", "-m", "hydra/launcher=joblib", "~model", "key"]
 )
 def test_flags_and_groups_are_left_alone(argument):
-    assert quoted(argument) == argument
+    assert quote(argument) == argument
 
 
 def test_a_command_gets_an_odd_path(inside, tmp_path):

@@ -71,7 +71,7 @@ def job(tmp_path, monkeypatch):
         )
         score = sweeps.run_job("train", objective)
         monkeypatch.undo()
-        return score, sweeps.unfinished(tmp_path)
+        return score, sweeps.why_unfinished(tmp_path)
 
     return run
 
@@ -199,8 +199,8 @@ def one_has_failed(folder: Path, done) -> None:
     assert done.returncode == 1, done.stdout + done.stderr
     assert "1 jobs are unfinished" in done.stdout
     bad, good = sorted(path for path in folder.iterdir() if path.is_dir())
-    assert "seed must be a whole number" in sweeps.unfinished(bad)
-    assert sweeps.unfinished(good) is None
+    assert "seed must be a whole number" in sweeps.why_unfinished(bad)
+    assert sweeps.why_unfinished(good) is None
     assert (good / "checkpoints" / "last.ckpt").is_file()
 
 

@@ -9,7 +9,7 @@ from gsgan.view.drag import (
     HANDLE_NAMES,
     HANDLES,
     HEAD_HANDLE,
-    dragged,
+    drag,
     fabrik,
     position,
 )
@@ -29,7 +29,7 @@ def test_bones_keep_their_lengths(name):
         p = REST.copy()
         for _ in range(3):
             target = position(p, name) + reach * generator.normal(size=3)
-            p = dragged(p, name, target)
+            p = drag(p, name, target)
             assert np.isfinite(p).all()
             np.testing.assert_allclose(lengths(p), lengths(REST), atol=1e-9)
 
@@ -50,7 +50,7 @@ def test_a_joint_goes_to_the_pointer_where_bones_reach(name):
         )
         side = start - pivot
         target = pivot + np.linalg.norm(side) * np.array([0.0, 0.6, 0.8])
-    moved = dragged(REST, name, target)
+    moved = drag(REST, name, target)
     assert np.linalg.norm(position(moved, name) - target) < 2e-3
     others = [i for i in range(33) if np.array_equal(moved[i], REST[i])]
     assert (len(others) > 20) == (
@@ -68,7 +68,7 @@ def test_a_straight_limb_bends():
 
 
 def test_out_of_reach_is_straight():
-    far = dragged(REST, "left wrist", np.array([9.0, 1.4, 0.0]))
+    far = drag(REST, "left wrist", np.array([9.0, 1.4, 0.0]))
     upper, lower = far[13] - far[11], far[15] - far[13]
     assert upper @ lower / np.linalg.norm(upper) / np.linalg.norm(
         lower
@@ -86,11 +86,11 @@ def test_hands_and_face_go_along(name, joints):
     """The landmarks that skeletons with hands and a face have beside the 33."""
     rest = np.array(HOLISTIC.rest_positions)
     target = position(rest, name) + np.array([0.1, 0.2, 0.1])
-    moved = dragged(rest, name, target)
+    moved = drag(rest, name, target)
     assert np.linalg.norm(moved[joints] - rest[joints], axis=-1).min() > 0.02
     before, after = (
         np.linalg.norm(p[joints] - p[joints[0]], axis=-1) for p in (rest, moved)
     )
     np.testing.assert_allclose(after, before, atol=1e-9)
     np.testing.assert_array_equal(moved[54:75], rest[54:75])
-    np.testing.assert_array_equal(moved[:33], dragged(rest[:33], name, target))
+    np.testing.assert_array_equal(moved[:33], drag(rest[:33], name, target))

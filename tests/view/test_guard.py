@@ -4,7 +4,7 @@ import gzip
 
 import pytest
 
-from gsgan.view.guard import guarded, refusal, with_probe
+from gsgan.view.guard import guard_server, refusal, with_probe
 
 HOST = "127.0.0.1:8080"
 
@@ -72,7 +72,7 @@ def test_a_page_whose_connection_is_refused_says_why(chromium):
     viser = pytest.importorskip(
         "viser", reason="the extra view is not installed"
     )
-    with guarded("127.0.0.1"):
+    with guard_server("127.0.0.1"):
         server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     port = server.get_port()
     page = chromium.new_page()
@@ -105,7 +105,7 @@ def test_visers_server_refuses_them():
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    with guarded("127.0.0.1"):
+    with guard_server("127.0.0.1"):
         server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
         address = f"127.0.0.1:{server.get_port()}"

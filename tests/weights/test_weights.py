@@ -21,7 +21,7 @@ from gsgan.weights.files import (
     get,
     read_convolutions,
 )
-from gsgan.weights.networks import pretrained
+from gsgan.weights.networks import load_pretrained
 
 ALEX = NETWORKS["alex"]
 
@@ -52,7 +52,7 @@ def state():
 
 
 def first_weight(path: Path) -> torch.Tensor:
-    return pretrained("alex", path).stages[0][0].weight
+    return load_pretrained("alex", path).stages[0][0].weight
 
 
 def test_torchvisions_file_a_file_of_features_and_their_folder_are_read(
@@ -114,7 +114,7 @@ def test_a_changed_file_of_the_package_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / ALEX.packaged
     path.write_bytes(pickle.dumps({"AlexNet_0": {}}))
     with pytest.raises(DataError, match="SHA-256"):
-        pretrained("alex", path)
+        load_pretrained("alex", path)
 
 
 class Malicious:
@@ -136,18 +136,18 @@ def test_files_that_are_no_weights_are_refused_and_run_no_code(tmp_path):
     ):
         path.write_bytes(content)
         with pytest.raises(DataError, match=r"weights\.pth.*not a readable"):
-            pretrained("alex", path)
+            load_pretrained("alex", path)
     assert not marker.exists()
     torch.save({"0.weight": "text"}, path)
     with pytest.raises(DataError, match="AlexNet"):
-        pretrained("alex", path)
+        load_pretrained("alex", path)
 
 
 def test_another_networks_weights_are_refused_by_name(state, tmp_path):
     path = tmp_path / "alex.pth"
     torch.save(state, path)
     with pytest.raises(DataError, match="VGG-16"):
-        pretrained("vgg", path)
+        load_pretrained("vgg", path)
     with pytest.raises(DataError, match=f"AlexNet.*{ALEX.file}"):
         find("alex", tmp_path / "nothing")
     with pytest.raises(ConfigError, match="vgg or alex"):

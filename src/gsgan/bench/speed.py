@@ -23,7 +23,7 @@ from gsgan.bench.common import (
     sentence,
 )
 from gsgan.data.datamodule import GsganData
-from gsgan.model.avatar import Avatar, unwatched
+from gsgan.model.avatar import Avatar, watch_nothing
 from gsgan.run.assemble import build_avatar, build_data
 from gsgan.run.runs import load_avatar
 from gsgan.run.stored import DataPaths, load_config
@@ -149,7 +149,7 @@ def load_subject(
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar = build_avatar(config, data.info, data.labelled("train"))
+        avatar = build_avatar(config, data.info, data.select_labelled("train"))
         name = "untrained avatar"
         marks = [
             "untrained weights: the time of F depends on the places of its Gaussians"
@@ -241,7 +241,9 @@ def without_denormals() -> Iterator[None]:
         torch.set_flush_denormal(False)
 
 
-def timed(action: Callable[[], object], device: torch.device | None) -> float:
+def measure_ms(
+    action: Callable[[], object], device: torch.device | None
+) -> float:
     """Milliseconds of one call, device synchronised."""
     # Kernels run asynchronously: the clock starts and stops when the device is idle.
     wait(device)
@@ -300,7 +302,7 @@ def measure(
         # End to end: the device is synchronised only at the end.
         frame = frames[i % len(frames)]
         clock = StageClock(device)
-        total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+        total = measure_ms(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         tick()
         if i < 0:
             continue
@@ -308,9 +310,9 @@ def measure(
         # The same frame by stage, with the device synchronised after each.
         avatar.stage = clock
         try:
-            staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+            staged = measure_ms(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
-            avatar.stage = unwatched
+            avatar.stage = watch_nothing
 
         # The time outside all stages.
         rest = staged - sum(clock.frame.values())
@@ -337,7 +339,7 @@ def in_batches(
     for _ in range(0, count, size):
         groups.append(cat(list(islice(repeated, size))))
     return deciles(
-        [timed(partial(painter, group), device) / size for group in groups]
+        [measure_ms(partial(painter, group), device) / size for group in groups]
     )
 
 
@@ -363,7 +365,7 @@ def settings_of(
         window = avatar.window(frame.skeleton, frame.camera)
         rows, columns = (height, width) if window is None else window.size
         pixels += rows * columns
-    found: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "image": f"{width} x {height}",
         "painted": f"{pixels / (len(frames) * height * width):.0%} of its pixels",
         "precision": config.precision,
@@ -377,16 +379,16 @@ def settings_of(
     # Settings of avatars with Gaussians.
     if avatar.splats is not None:
         backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
-        found |= {"accuracy": avatar.accuracy.name, "backend": backend}
-        found["channels of F"] = avatar.splat_channels
-        found["supersampling of F"] = avatar.accuracy.supersample
-        found["SH degree"] = avatar.splats.sh_degree
+        settings |= {"accuracy": avatar.accuracy.name, "backend": backend}
+        settings["channels of F"] = avatar.splat_channels
+        settings["supersampling of F"] = avatar.accuracy.supersample
+        settings["SH degree"] = avatar.splats.sh_degree
 
     # The number of Gaussians, on the body or on the skeleton.
     placed = avatar.body_points or avatar.densify
     if placed is not None:
-        found["Gaussians"] = placed.n_points
-    return found
+        settings["Gaussians"] = placed.n_points
+    return settings
 
 
 def text(

@@ -95,7 +95,7 @@ def available(skeleton: Tensor) -> bool:
     return known and native.available()
 
 
-def held(constants: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def to_constants(constants: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Constants of a body as `solve` takes them: on the CPU, float64 or int64."""
     held = {}
     for name, x in constants.items():
@@ -117,7 +117,8 @@ def solve(
     the bit in any batch and with any number of threads.
 
     Args:
-        constants, counts, numbers: by `CONSTANTS`, `COUNTS`, `NUMBERS`; `held`, fingers with hands.
+        constants, counts, numbers: by `CONSTANTS`, `COUNTS`, `NUMBERS`; as `to_constants` gives
+            them, fingers with hands.
         body: ``[B, 33, 3]`` finite, their visibility ``[B, 33]``, and ``[B, 33]`` bool, whether
             they were seen.
         hands: ``[B, 42, 3]``, and ``[B, 42]`` bool, whether they were seen and are finite.

@@ -122,17 +122,17 @@ class Fingers(nn.Module):
         # At first, hands turn as their palms.
         R = palm_frames(_palms(hands)) @ self.palms.mT
         for steps in FINGER_ROUNDS:
-            turns = self._turned(R, hands, seen, steps)
-            R, shift = _placed(self._posed(turns), hands, seen, R)
+            turns = self._turn(R, hands, seen, steps)
+            R, shift = _place(self._pose(turns), hands, seen, R)
         return Hands(
             turns=turns,
-            shown=self.shown(seen),
+            shown=self.has_landmarks(seen),
             rotations=R,
             shifts=shift,
-            placed=self.placed(seen),
+            placed=self.has_palms(seen),
         )
 
-    def _turned(
+    def _turn(
         self, R: Tensor, hands: Tensor, seen: Tensor, steps: int
     ) -> Tensor:
         """Turns ``[B, 20, 3]`` on hands that are turned by ``R [B, 2, 3, 3]`` since rest."""
@@ -155,7 +155,7 @@ class Fingers(nn.Module):
             numbers = numbers.clamp(self.minimum, self.maximum)
         return torch.cat(self._turns(numbers), dim=1)
 
-    def _posed(self, turns: Tensor) -> Tensor:
+    def _pose(self, turns: Tensor) -> Tensor:
         """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
         # The second joint of a finger turns after the first.
         first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
@@ -167,15 +167,15 @@ class Fingers(nn.Module):
         return rest.index_copy(1, self.chains[:, 1:].flatten(), x)
 
     @staticmethod
-    def placed(seen: Tensor) -> Tensor:
+    def has_palms(seen: Tensor) -> Tensor:
         """``[B, 2]`` bool: the hands whose palms have all their landmarks ``seen [B, 42]`` bool."""
         return _palms(seen).all(-1)
 
-    def shown(self, seen: Tensor) -> Tensor:
+    def has_landmarks(self, seen: Tensor) -> Tensor:
         """``[B, 20]`` bool: the joints that the landmarks ``seen [B, 42]`` bool determine."""
         # A first joint needs its own bone, a second joint one landmark beyond it.
         base, middle, next_one, tip = seen[:, self.chains].unbind(-1)
-        placed = self.placed(seen).repeat_interleave(len(FINGERS), dim=1)
+        placed = self.has_palms(seen).repeat_interleave(len(FINGERS), dim=1)
         first = base & middle & placed
         second = first & (next_one | tip)
         return torch.cat([first, second], dim=1)
@@ -194,12 +194,12 @@ class Fingers(nn.Module):
         own, others = self.axes.split([3, 2], dim=1)
 
         # The first joint turns the first bone.
-        first = _shown_turn(own, rest[:, :, 0], now[:, :, 0])
+        first = _find_turn(own, rest[:, :, 0], now[:, :, 0])
 
         # The second joint turns the sum of those beyond, as the first joint leaves it.
         before = axis_angle_to_matrix((first.unsqueeze(-1) * own).sum(2))
         beyond = (now[:, :, 1:].sum(2).unsqueeze(-2) @ before).squeeze(-2)
-        second = _shown_turn(others, rest[:, :, 1:].sum(2), beyond)
+        second = _find_turn(others, rest[:, :, 1:].sum(2), beyond)
         return torch.cat([first, second], dim=2).clamp(
             self.minimum, self.maximum
         )
@@ -237,7 +237,7 @@ class Fingers(nn.Module):
         return torch.linalg.solve(H, g)
 
 
-def _shown_turn(axes: Tensor, rest: Tensor, now: Tensor) -> Tensor:
+def _find_turn(axes: Tensor, rest: Tensor, now: Tensor) -> Tensor:
     """``[B, 10, n]`` components along axes of the shortest turns from ``rest`` to ``now``."""
     rest = normalize(rest, dim=-1, eps=1e-9)
     now = normalize(now, dim=-1, eps=1e-9)
@@ -261,7 +261,7 @@ def _palms(hands: Tensor) -> Tensor:
     return hands.unflatten(1, (2, HAND)).index_select(2, palm)
 
 
-def _placed(
+def _place(
     x: Tensor, hands: Tensor, seen: Tensor, R: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that move ``x`` to the landmarks seen.

@@ -131,14 +131,14 @@ def _accumulate(
     """World rotations ``[B, J, 3, 3]`` and positions ``[B, J, 3, 1]``, one level at a time."""
     plan = kinematic_plan(tuple(parents))
 
-    def taken(x: Tensor, index: tuple[int, ...], dim: int) -> Tensor:
+    def take(x: Tensor, index: tuple[int, ...], dim: int) -> Tensor:
         return x.index_select(dim, constant(index, x, torch.int64))
 
     # Joints in the order of their levels: offsets from the parent, and local rotations.
-    rest = taken(joints, plan.order, -2)
-    offsets = (rest - taken(joints, plan.parents, -2)).unsqueeze(-1)
+    rest = take(joints, plan.order, -2)
+    offsets = (rest - take(joints, plan.parents, -2)).unsqueeze(-1)
     offsets_by_level = offsets.split(plan.level_sizes, dim=-3)
-    ordered = taken(rotations, plan.order, 1)
+    ordered = take(rotations, plan.order, 1)
     rotations_by_level = list(ordered.split(plan.level_sizes, dim=1))
 
     # Roots stand at their rest position, moved by the translation.
@@ -147,14 +147,14 @@ def _accumulate(
 
     # Each further level follows the level above it.
     for level, places in enumerate(plan.parent_places, start=1):
-        parent_R = taken(rotations_by_level[level - 1], places, 1)
-        parent_position = taken(positions[-1], places, 1)
+        parent_R = take(rotations_by_level[level - 1], places, 1)
+        parent_position = take(positions[-1], places, 1)
         positions.append(parent_position + parent_R @ offsets_by_level[level])
         rotations_by_level[level] = parent_R @ rotations_by_level[level]
 
     # Back to the order of the joints.
-    R = taken(torch.cat(rotations_by_level, dim=1), plan.inverse, 1)
-    return R, taken(torch.cat(positions, dim=1), plan.inverse, 1)
+    R = take(torch.cat(rotations_by_level, dim=1), plan.inverse, 1)
+    return R, take(torch.cat(positions, dim=1), plan.inverse, 1)
 
 
 class KinematicPlan(NamedTuple):
@@ -246,7 +246,7 @@ def blend_transforms(
     return affine[..., :3], affine[..., 3]
 
 
-def stretched(
+def stretch_jacobian(
     A: Tensor,
     transforms: Tensor,
     vertices: Tensor,

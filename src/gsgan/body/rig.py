@@ -187,10 +187,10 @@ def build_rig(body: MarkedBody) -> BodyRig:
     axes = dict(zip(XYZ, rest_axes(body), strict=True))
     world = dict(zip(XYZ, torch.eye(3), strict=True))
     turns = _Turns(body, chains)
-    turns.append(Turn(0, _named("root", world)))
+    turns.append(Turn(0, _name_axes("root", world)))
     for k, joint in enumerate(SPINE):
-        turns.put("spine", _named(joint, axes), slice(k, k + 1))
-    turns.put("neck", _named("neck", axes))
+        turns.put("spine", _name_axes(joint, axes), slice(k, k + 1))
+    turns.put("neck", _name_axes("neck", axes))
 
     # Arms and legs.
     limbs = {}
@@ -202,7 +202,7 @@ def build_rig(body: MarkedBody) -> BodyRig:
     return _rig(body, turns, limbs)
 
 
-def _named(name: str, axes: dict[str, Tensor]) -> dict[str, Tensor]:
+def _name_axes(name: str, axes: dict[str, Tensor]) -> dict[str, Tensor]:
     return {f"{name}_{k}": axis for k, axis in axes.items()}
 
 
@@ -229,14 +229,14 @@ def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> LimbAxes:
     # Of a forearm of several bones, the first has the hinge, and all share the twist.
     first = slice(0, 1)
     collar = {"y": axes["y"], "z": axes["z"]}
-    turns.put("collar", _named(f"{side}_collar", collar))
+    turns.put("collar", _name_axes(f"{side}_collar", collar))
     turns.put("arm", _swing(f"{side}_arm", upper, flat), first)
     turns.put("arm", {f"{side}_arm_twist": upper})
     turns.put("forearm", {f"{side}_elbow": hinge}, first)
     turns.put("forearm", {f"{side}_elbow_side": across}, first)
     turns.put("forearm", {f"{side}_forearm_twist": lower})
     turns.put("hand", {f"{side}_wrist_a": hinge, f"{side}_wrist_b": across})
-    turns.put("thumb", _named(f"{side}_thumb", axes))
+    turns.put("thumb", _name_axes(f"{side}_thumb", axes))
     return LimbAxes(upper=upper, flat=flat, lower=lower)
 
 
@@ -257,7 +257,7 @@ def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> LimbAxes:
     turns.put(
         "shank", {f"{side}_knee_side": tilt, f"{side}_shank_twist": shank}
     )
-    turns.put("foot", _named(f"{side}_foot", axes))
+    turns.put("foot", _name_axes(f"{side}_foot", axes))
     turns.put("toe", {f"{side}_toe": axes["x"]})
     return LimbAxes(upper=thigh, flat=flat, lower=shank)
 
@@ -289,10 +289,10 @@ def _rig(
     ordered = sorted(turns, key=lambda turn: depth[turn.joint])
 
     # The numbers in the order of the turns, with the root's translation after its rotation.
-    found = list(
+    axis_names = list(
         dict.fromkeys(chain.from_iterable(turn.axes for turn in ordered))
     )
-    names = (*found[:3], *(f"transl_{k}" for k in XYZ), *found[3:])
+    names = (*axis_names[:3], *(f"transl_{k}" for k in XYZ), *axis_names[3:])
 
     # A joint without a turn moves with the last turn of the nearest joint above it.
     last = {turn.joint: i for i, turn in enumerate(ordered)}

@@ -80,17 +80,17 @@ class BodyShape:
 
     def __post_init__(self) -> None:
         # A tensor that is None has the expected shape.
-        found = []
+        faults = []
         for name, shape in SHAPES.items():
             value = getattr(self, name)
-            found.append(list(shape if value is None else value.shape))
-        if self.coefficients.ndim != 1 or found != list(
+            faults.append(list(shape if value is None else value.shape))
+        if self.coefficients.ndim != 1 or faults != list(
             map(list, SHAPES.values())
         ):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
                 f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, spine [1], got "
-                f"{', '.join(map(str, [list(self.coefficients.shape), *found]))}"
+                f"{', '.join(map(str, [list(self.coefficients.shape), *faults]))}"
             )
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
@@ -172,7 +172,7 @@ class ShapeSpace(Generic[B]):
             torch.zeros(self.coefficients), torch.ones(len(STRETCHED))
         )
 
-    def shaped(self, shape: BodyShape) -> B:
+    def body_of(self, shape: BodyShape) -> B:
         """The body in a shape; differentiable in the shape's tensors.
 
         Raises:
@@ -190,7 +190,7 @@ class ShapeSpace(Generic[B]):
             moved[name] = getattr(self.body, name).to(given) + used @ given
 
         # Bones are stretched; then what belongs to this person's skeletons is moved.
-        body = _stretched(replace(self.body, **moved), shape.stretch)
+        body = _stretch(replace(self.body, **moved), shape.stretch)
 
         # Offsets of landmarks, the curve of the back, and hands come after
         # stretching.
@@ -233,7 +233,7 @@ def limb_axes(body: MarkedBody) -> Tensor:
     return axes
 
 
-def _stretched(body: B, stretch: Tensor) -> B:
+def _stretch(body: B, stretch: Tensor) -> B:
     """The body with each joint's part scaled about that joint."""
     joints = body.joints
     groups = [STRETCHED.index(group_of(name)) for name in body.joint_names]
@@ -265,17 +265,19 @@ def _stretched(body: B, stretch: Tensor) -> B:
     A, t = blended.unflatten(-1, (3, 4)).split((3, 1), dim=-1)
 
     # Points that belong to one bone move with its part alone.
-    def carried(points: Tensor, bone: Tensor) -> Tensor:
+    def carry_points(points: Tensor, bone: Tensor) -> Tensor:
         return matvec(S[bone], points) + shift[bone]
 
     # Landmarks are carried by one bone each, as rigidly as its part.
     changes: dict[str, Any] = {
         "vertices": skin(body.vertices, A, t.squeeze(-1)),
         "joints": moved,
-        "landmarks": carried(body.landmarks, body.landmark_bone),
+        "landmarks": carry_points(body.landmarks, body.landmark_bone),
     }
     if isinstance(body, Body):
-        changes["hand_landmarks"] = carried(body.hand_landmarks, body.hand_bone)
+        changes["hand_landmarks"] = carry_points(
+            body.hand_landmarks, body.hand_bone
+        )
     return replace(body, **changes)
 
 
@@ -339,9 +341,9 @@ def free_space() -> ShapeSpace[Body]:
         ) from error
 
 
-def shaped_body(shape: BodyShape) -> Body:
+def shape_body(shape: BodyShape) -> Body:
     """The free body in a shape; differentiable in the shape's tensors."""
-    return free_space().shaped(shape)
+    return free_space().body_of(shape)
 
 
 def open_body(
@@ -370,7 +372,7 @@ def open_body(
     if kind == "free":
         if not betas:
             return free_body()
-        return shaped_body(BodyShape.of_flat(torch.tensor(betas)))
+        return shape_body(BodyShape.of_flat(torch.tensor(betas)))
     if kind is None or file is None:
         return None
 

@@ -70,7 +70,9 @@ class SkinnedBody:
         own_names = self.label_names[: len(names)]
         return self.label_source == "own" and tuple(names) == own_names
 
-    def voted(self, vertex_labels: Tensor, label_names: Sequence[str]) -> Self:
+    def with_labels(
+        self, vertex_labels: Tensor, label_names: Sequence[str]
+    ) -> Self:
         """The body with the data's labels on its vertices ``[V]``.
 
         Raises:
@@ -151,7 +153,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 class WeightGradients(nn.Module):
-    """How skinning weights change along a body's surface, for `gsgan.body.lbs.stretched`.
+    """How skinning weights change along a body's surface, for `gsgan.body.lbs.stretch_jacobian`.
 
     The gradients follow in the least squares sense from the differences between neighbours. They
     lie in the surface.
@@ -184,7 +186,7 @@ class WeightGradients(nn.Module):
 
     @torch.no_grad()
     def forward(self, index: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """The terms of `gsgan.body.lbs.stretched` for these skinning weights.
+        """The terms of `gsgan.body.lbs.stretch_jacobian` for these skinning weights.
 
         Only the `KEPT_BONES` bones of each vertex whose weights change most are used. The gradients
         of their weights are shifted to sum to zero, as those of all bones do.

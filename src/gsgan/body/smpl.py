@@ -134,13 +134,13 @@ def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:
     broken = [
         j for j, parent in enumerate(parents) if j and not 0 <= parent < j
     ]
-    found = f"no earlier parent for joint {broken[0]}" if broken else None
+    problem = f"no earlier parent for joint {broken[0]}" if broken else None
     if len(column) != table.shape[1] or len(column) < 2:
-        found = f"{len(column)} joints in {table.shape[1]} columns"
-    if found:
+        problem = f"{len(column)} joints in {table.shape[1]} columns"
+    if problem:
         raise DataError(
             f"{path}: 'kintree_table' must name every joint once, its parent before it; "
-            f"found {found}"
+            f"found {problem}"
         )
     return tuple(parents)
 
@@ -212,11 +212,11 @@ class SkinnedModel:
     @cached_property
     def joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The joints of the mean shape ``[J, 3]``, and their shape and expression directions."""
-        mean = self._regressed(self.v_template)
-        shape = self._regressed(self.shapedirs)
-        return mean, shape, self._regressed(self.expression_dirs)
+        mean = self._regress(self.v_template)
+        shape = self._regress(self.shapedirs)
+        return mean, shape, self._regress(self.expression_dirs)
 
-    def _regressed(self, x: Tensor) -> Tensor:
+    def _regress(self, x: Tensor) -> Tensor:
         """``[J, 3, ...]`` of the vertices' ``[V, 3, ...]``."""
         return (self.J_regressor @ x.flatten(1)).unflatten(1, x.shape[1:])
 

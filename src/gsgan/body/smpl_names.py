@@ -140,17 +140,17 @@ def group_of_part(name: str) -> str:
     """The group of a part or joint: "left_hand", "right_hand", "face_neck", or "" for any other."""
     if name == "face":
         return "face_neck"
-    group = _worn(name)
+    group = _clothes_of(name)
     return group if group in ("left_hand", "right_hand", "face_neck") else ""
 
 
 def is_limb(name: str) -> bool:
     """Whether a part or joint is of arms, hands, legs or feet; lower clothes are of legs."""
-    part = _worn(name)
+    part = _clothes_of(name)
     return part == "lower_clothes" or part.rpartition("_")[2] in LIMB_WORDS
 
 
-def _worn(name: str) -> str:
+def _clothes_of(name: str) -> str:
     """The part of `CLOTHES` of a joint; the name of another part."""
     is_joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
     return part_of_joint("clothes", name) if is_joint else name

@@ -208,7 +208,7 @@ class Solver(nn.Module):
 
         # Gradients need the steps in torch.
         if not self._live(skeleton) and compiled.available(skeleton):
-            return self._compiled(skeleton, visibility)
+            return self._solve_compiled(skeleton, visibility)
 
         # The 33 landmarks, about the middle of the hips.
         skeleton = skeleton.to(self.joints.device)
@@ -221,7 +221,7 @@ class Solver(nn.Module):
         p = p - shift
 
         # Hands: their fingers, and the landmarks of the palm if they place the hand.
-        found = None
+        fingers = None
         hands = skeleton[:, BODY:WITH_HAND_JOINTS]
         if self.fingers is not None and hands.shape[1]:
             seen = (
@@ -230,19 +230,19 @@ class Solver(nn.Module):
 
             # The finger solver says which hands can be placed, and where.
             near = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
-            found = self.fingers(near, seen)
+            fingers = self.fingers(near, seen)
 
             # Of a placed hand, the landmarks of the palm count instead of the
             # three of the 33.
-            replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
-            placed = found.placed.repeat_interleave(len(PALM), dim=1)
+            replaced = (fingers.placed.unsqueeze(-1) & self.replaced).any(1)
+            placed = fingers.placed.repeat_interleave(len(PALM), dim=1)
             held = placed.to(weight) / LANDMARK_NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
 
             # They are the body's own palm where the hand was placed, so that
             # their errors agree.
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
-            at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
+            at = own @ fingers.rotations.mT + fingers.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
 
         # Frame by frame, in chunks.
@@ -259,14 +259,14 @@ class Solver(nn.Module):
         transl = torch.cat(transls)
 
         # Fingers that are shown replace those at rest.
-        if self.fingers is not None and found is not None:
+        if self.fingers is not None and fingers is not None:
             joints = self.fingers.joints
-            shown = found.shown.unsqueeze(-1)
-            turns = torch.where(shown, found.turns, theta[:, joints])
+            shown = fingers.shown.unsqueeze(-1)
+            turns = torch.where(shown, fingers.turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
-    def _compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
+    def _solve_compiled(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """`solve` by compiled code."""
         # The compiled solver runs on the CPU, in the dtype of the skeleton.
         p = skeleton.cpu()
@@ -348,7 +348,7 @@ class Solver(nn.Module):
                 buffers["rounds"] = torch.tensor(FINGER_ROUNDS)
                 for name in compiled.FINGERS:
                     own[f"finger_{name}"] = buffers[name]
-            return compiled.held(own)
+            return compiled.to_constants(own)
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
@@ -380,7 +380,7 @@ class Solver(nn.Module):
         # A placed hand counts by its palm.
         fingers = self.fingers if hands.shape[1] else None
         if fingers is not None:
-            placed = fingers.placed(hands)
+            placed = fingers.has_palms(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
             seen = torch.cat(
                 [seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1
@@ -401,7 +401,7 @@ class Solver(nn.Module):
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
         moved = moved.scatter_add(1, joints, free[:, self.entry_number].float())
         if fingers is not None:
-            moved[:, fingers.joints] += fingers.shown(hands)
+            moved[:, fingers.joints] += fingers.has_landmarks(hands)
         return moved == 0
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -595,7 +595,7 @@ class Solver(nn.Module):
             # different units.
             diagonal = torch.diagonal(best.matrix, dim1=-2, dim2=-1)
             scaled = best.matrix + torch.diag_embed(damping * diagonal)
-            q = best_q + _solved(scaled, -best.gradient)
+            q = best_q + _solve_spd(scaled, -best.gradient)
 
             # The root's turn goes into its rotation: the next step starts from no turn.
             root = axis_angle_to_matrix(q[:, :3]) @ best_root
@@ -615,9 +615,9 @@ class Solver(nn.Module):
             )
 
             # A worse step is undone, with its equations.
-            best_q = _chosen(better, q, best_q)
-            best_root = _chosen(better, root, best_root)
-            best = NormalEquations(*map(partial(_chosen, better), new, best))
+            best_q = _select(better, q, best_q)
+            best_root = _select(better, root, best_root)
+            best = NormalEquations(*map(partial(_select, better), new, best))
             if bool(done.all()):
                 break
         return best_q, best_root
@@ -635,11 +635,11 @@ class Solver(nn.Module):
             H = self.normal(q, self.linear(q, root, p), weight).matrix
         for _ in range(GRADIENT_STEPS if self._live(p) else 1):
             at = self.normal(q, self.linear(q, root, p), weight)
-            q = q - _solved(H, at.gradient)
+            q = q - _solve_spd(H, at.gradient)
         return q
 
 
-def _chosen(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
+def _select(frames: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """``a`` of the frames ``[B]`` bool, ``b`` of the others."""
     return torch.where(frames.view(-1, *[1] * (a.ndim - 1)), a, b)
 
@@ -688,14 +688,14 @@ def _jumps(parent: Tensor) -> Tensor:
     # Twice as far each time, until every turn arrives at the identity.
     T = len(parent)
     jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
-    found = []
+    jumps = []
     while bool((jump < T).any()):
-        found.append(jump)
+        jumps.append(jump)
         jump = jump[jump]
-    return torch.stack(found)
+    return torch.stack(jumps)
 
 
-def _solved(H: Tensor, g: Tensor) -> Tensor:
+def _solve_spd(H: Tensor, g: Tensor) -> Tensor:
     """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
     # Without a check, which would wait for the device.
     factor, _ = torch.linalg.cholesky_ex(H)

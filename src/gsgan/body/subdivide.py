@@ -13,7 +13,7 @@ from gsgan.utils.arrays import Ints
 B = TypeVar("B", bound=SkinnedBody)
 
 
-def subdivided(body: B, count: int) -> B:
+def subdivide(body: B, count: int) -> B:
     """The body with ``count`` vertices, whose first ones are its own.
 
     The longest edges get a vertex in their middle, so that vertices spread more evenly. It has the
@@ -21,11 +21,11 @@ def subdivided(body: B, count: int) -> B:
     no more than the body's vertices changes nothing.
     """
     while len(body.vertices) < count:
-        body = _halved(body, count - len(body.vertices))
+        body = _halve(body, count - len(body.vertices))
     return body
 
 
-def _halved(body: B, maximum: int) -> B:
+def _halve(body: B, maximum: int) -> B:
     """The body with at most so many edges halved, the longest first."""
     # Every edge once, and the edges ab, bc and ca of each face.
     faces = body.faces.numpy()
@@ -74,14 +74,14 @@ def _split(faces: Ints, middles: Ints) -> Ints:
     """Triangles ``[F', 3]`` of faces whose edges ab, bc and ca have these middles, -1 for none."""
     halved = middles >= 0
     number = halved.sum(1)
-    found = [faces[number == 0]]
+    parts = [faces[number == 0]]
 
     # All three edges: a triangle at each corner, and one between the middles.
     own = number == 3
     a, b, c = faces[own].T
     ab, bc, ca = middles[own].T
     for triangle in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        found.append(np.stack(triangle, axis=1))
+        parts.append(np.stack(triangle, axis=1))
 
     # Faces are turned until ab is the halved edge, or ca the one that is not.
     for turn in range(3):
@@ -91,10 +91,10 @@ def _split(faces: Ints, middles: Ints) -> Ints:
         # One halved edge gives two triangles.
         one = (number == 1) & halved[:, turn]
         for triangle in ((a, ab, c), (ab, b, c)):
-            found.append(np.stack(triangle, axis=1)[one])
+            parts.append(np.stack(triangle, axis=1)[one])
 
         # Two halved edges give three.
         two = (number == 2) & ~halved[:, (turn + 2) % 3]
         for triangle in ((ab, b, bc), (a, ab, bc), (a, bc, c)):
-            found.append(np.stack(triangle, axis=1)[two])
-    return np.concatenate(found)
+            parts.append(np.stack(triangle, axis=1)[two])
+    return np.concatenate(parts)

@@ -6,13 +6,13 @@ from itertools import combinations
 
 import numpy as np
 
-from gsgan.check.report import Finding, listed
+from gsgan.check.report import Finding, list_names
 from gsgan.check.settings import Limits
 from gsgan.check.views import (
     CheckedData,
     MaskView,
     body_silhouette,
-    grouped,
+    group_by_camera,
     overlap,
 )
 from gsgan.data.cameras import CameraEntry
@@ -69,7 +69,7 @@ class CameraScore:
             self.overlap + limits.better_fit, CREDIBLE_OVERLAP
         )
 
-    def oversized(self, limits: Limits) -> bool:
+    def is_oversized(self, limits: Limits) -> bool:
         """Whether the masks are far larger than the body, and most of the body lies in them."""
         return (
             self.fullness > limits.fullness
@@ -80,7 +80,7 @@ class CameraScore:
         """Whether calibration or masks are wrong as a whole."""
         # Without a known joint the share is NaN, which is wrong as well.
         outside = not self.inside >= limits.inside_error
-        return outside or self.beaten(limits) or self.oversized(limits)
+        return outside or self.beaten(limits) or self.is_oversized(limits)
 
     def close_rivals(self, limits: Limits) -> list[str]:
         """The other calibrations that fit about as well as the best."""
@@ -95,7 +95,7 @@ def score_cameras(
 ) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
-    for name, own in grouped(views).items():
+    for name, own in group_by_camera(views).items():
         # Each rival's better variant, best rival first.
         chosen = spread(own, TRIED)
         camera = subject.cameras[name]
@@ -122,11 +122,11 @@ def score_cameras(
         scores.append(
             CameraScore(
                 name,
-                inside=known_mean(inside),
+                inside=mean_of_known(inside),
                 overlap=_fit(subject, chosen, camera),
                 fullness=float(np.median(fullness)),
                 rivals=dict(best_first),
-                outside=known_mean(outside),
+                outside=mean_of_known(outside),
                 inverted=_fit(subject, inverted, camera),
                 filled=float(np.median([view.filled for view in own])),
                 others=float(
@@ -174,7 +174,7 @@ def _fit(
     return float(np.mean(overlaps))
 
 
-def known_mean(values: Sequence[float]) -> float:
+def mean_of_known(values: Sequence[float]) -> float:
     """The mean of the values that are not NaN; NaN if there are none."""
     array = np.array(values)
     known = array[~np.isnan(array)]
@@ -188,11 +188,11 @@ def calibration_findings(
     named: Iterable[str] = (),
 ) -> list[Finding]:
     """Findings on wrong cameras and the usual causes; other findings name ``named`` already."""
-    found = list[Finding]()
+    findings = list[Finding]()
     named = set(named)
 
     # Masks far larger than the body: one finding for all of them, which then do not count.
-    big = [s for s in scores if s.oversized(limits) and s.name not in named]
+    big = [s for s in scores if s.is_oversized(limits) and s.name not in named]
     if big:
         # One sentence names all of them with their sizes.
         sizes = []
@@ -200,10 +200,11 @@ def calibration_findings(
             sizes.append(f"{score.name} {score.fullness:.1f}")
             named.add(score.name)
         text = (
-            f"masks are far larger than the body (times its area: {listed(sizes)}): a focal length "
-            "that is too short, K of smaller images, a skeleton in another unit, or masks of more"
+            f"masks are far larger than the body (times its area: {list_names(sizes)}): a focal "
+            "length that is too short, K of smaller images, a skeleton in another unit, or "
+            "masks of more"
         )
-        found.append(Finding("error", TOPIC, text))
+        findings.append(Finding("error", TOPIC, text))
         scores = [score for score in scores if score not in big]
 
     # Pairs that fit better with each other's calibration.
@@ -211,20 +212,20 @@ def calibration_findings(
     for one, other in combinations(beaten, 2):
         if one.name in named or other.name in named:
             continue
-        if _exchanged(one, other, limits):
+        if _are_exchanged(one, other, limits):
             text = (
                 f"cameras {one.name} and {other.name} look exchanged: the R and t of the other "
                 f"would fit the masks better (overlap {one.rivals[other.name]:.2f} and "
                 f"{other.rivals[one.name]:.2f}, its own {one.overlap:.2f} and {other.overlap:.2f});"
                 " exchange them in the calibration, or rename the folders"
             )
-            found.append(Finding("error", TOPIC, text))
+            findings.append(Finding("error", TOPIC, text))
             named.update((one.name, other.name))
 
     # All cameras are off, so no single one is the cause.
     off = [score for score in scores if not score.inside >= min_inside]
     if len(scores) > 1 and not beaten and not big and off == scores:
-        shares = listed(
+        shares = list_names(
             f"{score.name} {percent(score.inside)}" for score in scores
         )
         text = (
@@ -242,10 +243,10 @@ def calibration_findings(
             continue
         finding = _of_one(score, scores, limits, min_inside)
         if finding:
-            found.append(finding)
+            findings.append(finding)
         else:
             fine.append(score)
-    return found + small_errors(fine, limits)
+    return findings + small_errors(fine, limits)
 
 
 def mask_findings(
@@ -253,18 +254,18 @@ def mask_findings(
 ) -> list[Finding]:
     """Findings on masks that are wrong in themselves: empty, white, inverted, of another person."""
     # In all cameras: then nothing else can be told. One camera has a finding of its own.
-    names = listed(score.name for score in scores)
+    names = list_names(score.name for score in scores)
     wrong = "every mask must be white where the person is, and black elsewhere"
     if scores and all(score.filled == 0 for score in scores):
         text = f"all masks are empty ({names}); {wrong}"
         return [Finding("error", TOPIC, text)]
 
     # White everywhere, or inverted.
-    found = []
+    findings = []
     full = [score.name for score in scores if score.filled > FULL]
     if full:
-        text = f"masks are white everywhere ({listed(full)}); {wrong}"
-        found.append(Finding("error", TOPIC, text))
+        text = f"masks are white everywhere ({list_names(full)}); {wrong}"
+        findings.append(Finding("error", TOPIC, text))
     inverted = []
     for score in scores:
         limit = max(score.overlap + limits.better_fit, CREDIBLE_OVERLAP)
@@ -274,10 +275,10 @@ def mask_findings(
             )
     if inverted:
         text = (
-            f"the inverted masks would fit (overlap: {listed(inverted)}): the person must be white "
-            "and the background black; invert them"
+            f"the inverted masks would fit (overlap: {list_names(inverted)}): the person must be "
+            "white and the background black; invert them"
         )
-        found.append(Finding("error", TOPIC, text))
+        findings.append(Finding("error", TOPIC, text))
 
     # A second body.
     several = []
@@ -287,14 +288,16 @@ def mask_findings(
     if several:
         text = (
             "masks have a second piece, as large as a person, that holds no joint (of the images: "
-            f"{listed(several)}): another person, whom training would learn as well; remove it "
+            f"{list_names(several)}): another person, whom training would learn as well; remove it "
             "from the masks"
         )
-        found.append(Finding("warning", TOPIC, text))
-    return found
+        findings.append(Finding("warning", TOPIC, text))
+    return findings
 
 
-def _exchanged(one: CameraScore, other: CameraScore, limits: Limits) -> bool:
+def _are_exchanged(
+    one: CameraScore, other: CameraScore, limits: Limits
+) -> bool:
     """Whether each of two cameras is among those that fit the other's masks best."""
     first = other.name in one.close_rivals(limits)
     return first and one.name in other.close_rivals(limits)
@@ -309,7 +312,7 @@ def _of_one(
     """The finding on one camera; None if nothing is wrong."""
     seen = f"{percent(score.inside)} of the joints lie inside its masks"
     if len(scores) > 1:
-        others = known_mean([s.inside for s in scores if s is not score])
+        others = mean_of_known([s.inside for s in scores if s is not score])
         seen += f", {others:.0%} in the other cameras"
 
     # Another calibration fits better, or joints lie outside the masks.
@@ -364,7 +367,7 @@ def small_errors(
         return [Finding("warning", TOPIC, text)]
 
     # One camera is off much more than the others.
-    found = []
+    findings = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
         others = float(np.median(rest)) if rest else np.inf
@@ -373,5 +376,5 @@ def small_errors(
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
                 f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly off"
             )
-            found.append(Finding("warning", TOPIC, text))
-    return found
+            findings.append(Finding("warning", TOPIC, text))
+    return findings

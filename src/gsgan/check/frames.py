@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.check.report import Finding, listed
+from gsgan.check.report import Finding, list_names
 from gsgan.check.settings import Limits
-from gsgan.check.views import CheckedData, MaskView, grouped
+from gsgan.check.views import CheckedData, MaskView, group_by_camera
 from gsgan.data.skeletons import bone_lengths
 from gsgan.data.validation import spans
 from gsgan.skeleton import MEDIAPIPE33
@@ -61,7 +61,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     p = subject.seen_p
     template = subject.template
     names = template.names
-    found = list[Doubt]()
+    doubts = list[Doubt]()
 
     # Each kind of doubt is a table of flags by frame and joint.
     def doubt(
@@ -77,7 +77,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
             for place in np.flatnonzero(flags[row]).tolist():
                 texts.append(text(row, place))
             frame = int(subject.frames[row])
-            found.append(Doubt(frame, kind, f"{what}{listed(texts, 3)}"))
+            doubts.append(Doubt(frame, kind, f"{what}{list_names(texts, 3)}"))
 
     # Jumps, unless neighbours in the list are not neighbours in time.
     jump = jump_distance(p)
@@ -85,7 +85,7 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     jump[1:][gap] = np.nan
     jump[:-1][gap] = np.nan
     usual = float(np.quantile(np.nan_to_num(jump), 0.75))
-    jumps = jumped(jump, max(limits.joint_jump, JUMP_RATIO * usual))
+    jumps = find_jumps(jump, max(limits.joint_jump, JUMP_RATIO * usual))
     doubt(
         "jump",
         "jumps: ",
@@ -128,10 +128,10 @@ def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
         pixels > limits.reprojection * float(focal),
         lambda row, joint: text.format(names[joint], pixels[row, joint]),
     )
-    return found
+    return doubts
 
 
-def exchanged_sides(subject: CheckedData) -> Bool:
+def find_exchanges(subject: CheckedData) -> Bool:
     """The groups ``[F, G]``, `FLIP_GROUPS`, whose left and right are exchanged for a time.
 
     Exchanged throughout is another finding: a motion without any change of sides has none here.
@@ -176,7 +176,7 @@ def mask_doubts(
     unfit: Collection[str] = (),
 ) -> Iterable[Doubt]:
     """Reasons to doubt masks, without the cameras ``unfit``, whose masks fit in no frame."""
-    for name, own in grouped(views).items():
+    for name, own in group_by_camera(views).items():
         if name in unfit:
             continue
 
@@ -227,13 +227,14 @@ def frame_findings(
 
     # Left and right exchanged for a time: an error with the frames of each part.
     if not mirrored:
-        wrong = exchanged_sides(subject)
+        wrong = find_exchanges(subject)
         for part, flags in zip(PARTS, wrong.T, strict=True):
             frames = subject.frames[flags].tolist()
             if frames:
                 text = (
                     f"left and right of the {part} are exchanged in {len(frames)} of {count} "
-                    f"frames: {shortened(frames)}; correct the landmarks, or leave these frames out"
+                    f"frames: {format_ranges(frames)}; correct the landmarks, or leave these "
+                    "frames out"
                 )
                 findings.append(Finding("error", "skeleton", text))
 
@@ -243,7 +244,7 @@ def frame_findings(
         if some and not (mirrored and kind == "backwards"):
             frames = sorted({doubt.frame for doubt in some})
             text = (
-                f"{what} in {len(frames)} of {count} frames: {shortened(frames)} "
+                f"{what} in {len(frames)} of {count} frames: {format_ranges(frames)} "
                 f"(frame {some[0].frame}: {some[0].text})"
             )
             findings.append(Finding("warning", "frames", text))
@@ -256,7 +257,7 @@ def frame_findings(
     return findings
 
 
-def shortened(frames: Sequence[int], maximum: int = 8) -> str:
+def format_ranges(frames: Sequence[int], maximum: int = 8) -> str:
     """Frame numbers as ranges, the rest of a long list left out."""
     # Ranges count, not frames.
     ranges = spans(list(frames)).split(", ")
@@ -275,7 +276,7 @@ def jump_distance(p: Float) -> Float:
     return distance
 
 
-def jumped(distance: Float, limit: float) -> Bool:
+def find_jumps(distance: Float, limit: float) -> Bool:
     """``[F, J]`` whether `jump_distance` has a peak beyond the limit.
 
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.

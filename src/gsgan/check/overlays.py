@@ -73,7 +73,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
         mapping = undistort_map(camera, window)
     size = (TILE_HEIGHT, round(TILE_HEIGHT * ASPECT))
 
-    def shown(image: Bytes) -> Bytes:
+    def cut_tile(image: Bytes) -> Bytes:
         return resize(
             take(image, window, mapping, exact=False), size, exact=False
         )
@@ -81,9 +81,9 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     # The image, the mask and the joints in the same window.
     layout = subject.layout
     image = read_colour(layout.image_path(view.camera, view.frame))
-    canvas = np.ascontiguousarray(shown(image))
+    canvas = np.ascontiguousarray(cut_tile(image))
     mask = read_mask(layout.mask_files(view.camera, view.frame), layout.pixels)
-    person = (shown(mask) > 127).astype(np.uint8)
+    person = (cut_tile(mask) > 127).astype(np.uint8)
 
     # The mask's outline.
     contours, _ = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -93,12 +93,12 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     corner = (window.left, window.top)
     scale = np.array(size[::-1]) / np.array(window.size[::-1])
 
-    def placed(pixels: Float) -> list[list[int]]:
+    def to_tile(pixels: Float) -> list[list[int]]:
         at = (np.clip(pixels, -FAR_PIXELS, FAR_PIXELS) - corner) * scale
         return np.round(at - 0.5).astype(np.int32).tolist()
 
     # Bones with a black rim, in the colour of their side.
-    at = placed(joints)
+    at = to_tile(joints)
     names = subject.template.names
     for a, b in subject.template.edges:
         if drawn[a] and drawn[b]:
@@ -117,7 +117,7 @@ def tile(subject: CheckedData, view: MaskView) -> Bytes:
     # Hands and face as dots.
     for p, colour in _hands_and_face(subject, view.frame):
         pixels, depth = project(camera, p)
-        for centre in placed(pixels[depth > NEAR]):
+        for centre in to_tile(pixels[depth > NEAR]):
             cv2.circle(canvas, centre, 1, colour, -1, cv2.LINE_AA)
     return canvas
 
@@ -127,17 +127,17 @@ def _hands_and_face(
     frame: int,
 ) -> list[tuple[Float, tuple[int, int, int]]]:
     """The visible landmarks ``[N, 3]`` of left hand, right hand and face, with their colours."""
-    found = []
+    landmarks = []
     hands = subject.layout.hands
     face = subject.layout.face
     if hands is not None and frame in hands.p:
         p = hands.p[frame]
         seen = hands.visibility[frame] > 0
-        found.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
-        found.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
+        landmarks.append((p[:HAND][seen[:HAND]], LEFT_COLOUR))
+        landmarks.append((p[HAND:][seen[HAND:]], RIGHT_COLOUR))
     if face is not None and frame in face.p:
-        found.append((face.seen(frame), MIDDLE_COLOUR))
-    return found
+        landmarks.append((face.visible_joints(frame), MIDDLE_COLOUR))
+    return landmarks
 
 
 def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:

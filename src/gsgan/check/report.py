@@ -114,12 +114,12 @@ class CheckReport:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All findings, errors first."""
-        found: list[Finding] = []
+        collected: list[Finding] = []
         for section in self.sections:
-            found += section.findings
+            collected += section.findings
         # Sorting keeps the order of the sections within each level.
         return tuple(
-            sorted(found, key=lambda finding: finding.level != "error")
+            sorted(collected, key=lambda finding: finding.level != "error")
         )
 
     @property
@@ -138,16 +138,16 @@ class CheckReport:
         # One sentence for the page and the terminal.
         if not self.findings:
             return "nothing wrong was found"
-        return f"{counted(self.errors, 'error')}, {counted(self.warnings, 'warning')}"
+        return f"{count_of(self.errors, 'error')}, {count_of(self.warnings, 'warning')}"
 
 
-def counted(number: int, noun: str) -> str:
+def count_of(number: int, noun: str) -> str:
     """A number and its noun: "1 error", "2 errors"."""
     plural = "" if number == 1 else "s"
     return f"{number} {noun}{plural}"
 
 
-def listed(names: Iterable[object], maximum: int = 6) -> str:
+def list_names(names: Iterable[object], maximum: int = 6) -> str:
     """Names with commas, the rest of a long list counted."""
     shown = list(map(str, names))
     text = ", ".join(shown[:maximum])

@@ -18,12 +18,12 @@ from gsgan.check.calibration import (
     score_cameras,
 )
 from gsgan.check.frames import (
+    format_ranges,
     frame_findings,
     mask_doubts,
-    shortened,
     skeleton_doubts,
 )
-from gsgan.check.report import Figure, Finding, Section, Table, counted
+from gsgan.check.report import Figure, Finding, Section, Table, count_of
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import CheckedData
 from gsgan.data.formats.consistency import camera_distances, far_cameras, spread
@@ -93,21 +93,25 @@ def geometry_findings(
     subject: CheckedData, geometry: Geometry
 ) -> list[Finding]:
     """Findings on implausible units, a camera in another unit, and an up axis that is not up."""
-    found = [Finding("error", "units", text) for text in geometry.far.values()]
+    findings = [
+        Finding("error", "units", text) for text in geometry.far.values()
+    ]
 
     # A height that is impossible, or only unlikely.
     stature = geometry.stature
     if not PLAUSIBLE[0] <= stature <= PLAUSIBLE[1]:
         text = f"limb lengths suggest a person of {stature:.3g} m; check unit and joint order"
         possible = POSSIBLE[0] <= stature <= POSSIBLE[1]
-        found.append(Finding("warning" if possible else "error", "units", text))
+        findings.append(
+            Finding("warning" if possible else "error", "units", text)
+        )
 
     if geometry.lean > MAX_LEAN:
         way = axis_name(geometry.up)
         axis = subject.layout.meta.up_axis
         text = f"the trunk points along {way}, {geometry.lean:.0f} degrees from the up axis {axis}"
-        found.append(Finding("warning", "units", text))
-    return found
+        findings.append(Finding("warning", "units", text))
+    return findings
 
 
 def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
@@ -208,7 +212,7 @@ class Measurements:
         self.subject = subject
 
         # The sampled images, and those that were cut off; all are decoded once.
-        items = views.sampled_items(subject, sampling.images)
+        items = views.sample_items(subject, sampling.images)
         items += views.cut_items(subject, sampling.images)
         self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
@@ -273,17 +277,17 @@ def sections(m: Measurements) -> Sequence[Section]:
         geometry_table(m.subject, m.geometry),
         lens_table(m.subject, m.geometry),
     )
-    found = geometry_findings(m.subject, m.geometry)
+    findings = geometry_findings(m.subject, m.geometry)
 
     # One strip of images per camera.
     strips = []
-    for name, own in views.grouped(m.views).items():
+    for name, own in views.group_by_camera(m.views).items():
         shown = spread(own, m.sampling.shown)
         image = overlays.strip(m.subject, shown, m.reasons)
         strips.append(Figure(f"camera {name}", image))
     return (
         _contents(m),
-        Section("Units and cameras", units, found),
+        Section("Units and cameras", units, findings),
         _agreement(m),
         Section("Overlays", figures=strips, text=overlays.LEGEND),
         _frames(m),
@@ -308,7 +312,7 @@ def _contents(m: Measurements) -> Section:
     contents = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
-        ("frames", f"{len(frames)}: {shortened(frames)}"),
+        ("frames", f"{len(frames)}: {format_ranges(frames)}"),
         (
             "images",
             f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)",
@@ -335,17 +339,17 @@ def _contents(m: Measurements) -> Section:
         contents.append(("note of the reader", note))
 
     # Damaged and missing images.
-    found = [*m.broken, *_doubtful_notes(layout.notes)]
+    findings = [*m.broken, *_doubtful_notes(layout.notes)]
     for name, files in subject.pairs.items():
         lacking = sorted(set(frames) - set(files))
         if lacking:
             # Long lists of numbers are shortened to ranges.
-            text = f"{len(lacking)} of the {len(frames)} frames: {shortened(lacking)}"
-            found.append(
+            text = f"{len(lacking)} of the {len(frames)} frames: {format_ranges(lacking)}"
+            findings.append(
                 Finding("warning", "files", f"camera {name} lacks {text}")
             )
     table = Table(("what", "how much"), contents)
-    return Section("Contents", (table,), found)
+    return Section("Contents", (table,), findings)
 
 
 def _doubtful_notes(notes: Iterable[str]) -> Iterator[Finding]:
@@ -374,8 +378,8 @@ def _split(data: GsganData, name: str) -> str:
     items = data.splits.items[name]
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
-    cameras = counted(len(items.cameras), "camera")
-    return f"{counted(len(items), 'image')}: {cameras}, frames {shortened(items.frames)}"
+    cameras = count_of(len(items.cameras), "camera")
+    return f"{count_of(len(items), 'image')}: {cameras}, frames {format_ranges(items.frames)}"
 
 
 def _agreement(m: Measurements) -> Section:
@@ -408,15 +412,15 @@ def _agreement(m: Measurements) -> Section:
 
     # Findings by the thresholds that the reader of the data uses too.
     min_inside = m.subject.consistency.min_inside
-    found = mask_findings(m.cameras, m.limits)
-    if not any(finding.level == "error" for finding in found):
-        found += calibration_findings(
+    findings = mask_findings(m.cameras, m.limits)
+    if not any(finding.level == "error" for finding in findings):
+        findings += calibration_findings(
             m.cameras, m.limits, min_inside, m.geometry.far
         )
     return Section(
         "Skeleton, masks and cameras",
         (table,),
-        found,
+        findings,
         text=AGREEMENT,
     )
 
@@ -430,8 +434,8 @@ def _frames(m: Measurements) -> Section:
     if rows:
         tables = (Table(("frame", "why"), rows[:TABLE_FRAMES]),)
     text = (
-        f"{counted(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
-        f"frames, masks in {counted(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
+        f"{count_of(len(rows), 'frame')} of {len(m.subject.frames)}; skeletons were checked in all "
+        f"frames, masks in {count_of(len(m.views), 'image')}. At most {TABLE_FRAMES} are listed; "
         "the JSON file has all."
     )
     findings = frame_findings(m.subject, m.doubts, m.limits)

@@ -174,7 +174,7 @@ class MaskView:
         return 1 - self.beyond.sum() / known if known else np.nan
 
 
-def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
+def group_by_camera(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     """The views by camera."""
     groups: dict[str, list[MaskView]] = {}
     for view in views:
@@ -182,7 +182,7 @@ def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     return groups
 
 
-def sampled_items(subject: CheckedData, images: int) -> list[Item]:
+def sample_items(subject: CheckedData, images: int) -> list[Item]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
     # The same moments in all cameras, as many as the budget allows.
     each = max(1, images // len(subject.pairs))
@@ -201,15 +201,15 @@ def sampled_items(subject: CheckedData, images: int) -> list[Item]:
 def cut_items(subject: CheckedData, maximum: int) -> list[Item]:
     """At most ``maximum`` items with an image or mask file that was cut off; none is decoded."""
     layout = subject.layout
-    found: list[Item] = []
+    items: list[Item] = []
     for name, files in subject.pairs.items():
         for frame in files:
-            if len(found) == maximum:
-                return found
+            if len(items) == maximum:
+                return items
             masks = [path for _, path in layout.mask_files(name, frame)]
             if not all(map(complete, [layout.image_path(name, frame), *masks])):
-                found.append((name, frame))
-    return found
+                items.append((name, frame))
+    return items
 
 
 def measure(
@@ -230,12 +230,12 @@ def measure(
     unique = tuple(dict.fromkeys(items))
     bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
-        found = bar.track(
+        measured = bar.track(
             pool.map(one, unique),
             len(unique),
             description="checking images",
         )
-        results = list(found)
+        results = list(measured)
 
     # Images that cannot be read are findings.
     views = []

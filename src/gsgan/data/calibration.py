@@ -137,22 +137,22 @@ def find_calibration(folder: Path) -> Path:
             files.update(place.glob(pattern))
 
     # Other .toml files are configs.
-    found = []
+    paths = []
     for path in sorted(files):
         if path.suffix != ".toml" or b"matrix" in path.read_bytes():
-            found.append(path)
+            paths.append(path)
 
     # Exactly one must be left.
-    if not found:
+    if not paths:
         raise DataError(
             f"{folder} holds no calibration; give calibration=<file>: {KNOWN}"
         )
-    if len(found) > 1:
-        names = ", ".join(str(path.relative_to(folder)) for path in found)
+    if len(paths) > 1:
+        names = ", ".join(str(path.relative_to(folder)) for path in paths)
         raise DataError(
             f"{folder} holds more than one calibration ({names}); give calibration=<file>"
         )
-    return found[0]
+    return paths[0]
 
 
 def read_calibration(
@@ -304,14 +304,14 @@ def _read_json(
     """The cameras of cameras.json; a meta.json next to it gives unit and pixel centre."""
     # Without meta.json, the defaults of the bring-your-own layout.
     meta = path.with_name("meta.json")
-    found = Conventions()
+    conventions = Conventions()
     if meta.is_file():
-        found = read_conventions(meta, read_json(meta))
+        conventions = read_conventions(meta, read_json(meta))
 
     # A unit that the user gives comes first.
     if scale:
-        found = replace(found, scale=scale)
-    return read_cameras(path, read_json(path), found)
+        conventions = replace(conventions, scale=scale)
+    return read_cameras(path, read_json(path), conventions)
 
 
 def _read_dataset_json(
@@ -423,7 +423,7 @@ def _toml_camera(
     # A rotation that is no matrix is a Rodrigues vector.
     R = entry["rotation"]
     if as_floats(R).shape != (3, 3):
-        R = _turned_by(where, R, "rotation")
+        R = _rotation_matrix(where, R, "rotation")
     return make_camera(
         where,
         name,
@@ -572,11 +572,11 @@ def _opencv_rotation(where: str, name: str, extri: Mapping[str, Any]) -> Any:
     # Files have the matrix, the vector, or both.
     R = extri.get(f"Rot_{name}")
     if R is None and f"R_{name}" in extri:
-        R = _turned_by(where, extri[f"R_{name}"], f"R_{name}")
+        R = _rotation_matrix(where, extri[f"R_{name}"], f"R_{name}")
     return R
 
 
-def _turned_by(where: str, value: Any, what: str) -> Any:
+def _rotation_matrix(where: str, value: Any, what: str) -> Any:
     """The matrix ``[3, 3]`` of a Rodrigues vector, whose length is an angle in radians."""
     vector = numbers(where, value, what, (3,))
     angle = float(np.linalg.norm(vector))
@@ -630,10 +630,10 @@ def _qualisys_camera(
     pixel_centre: float,
 ) -> CameraEntry:
     def values(element: str, *keys: str) -> Float:
-        found = camera.find(element)
-        if found is None:
+        node = camera.find(element)
+        if node is None:
             raise DataError(f"{where} lacks <{element}>; export it again")
-        raw = [found.get(key) for key in keys]
+        raw = [node.get(key) for key in keys]
         return numbers(where, raw, f"{element} {' '.join(keys)}", (len(keys),))
 
     # Axes are rows; y points up and z backward.

@@ -72,7 +72,7 @@ class CameraEntry:
         few = not self.fisheye and not self.dist[5:].any()
         return self.distorted and few
 
-    def seen(
+    def view_of(
         self, window: Crop, size: tuple[int, int] | None, *, lens: bool
     ) -> Camera:
         """The camera of a window of the image.

@@ -218,12 +218,12 @@ def undistort(points: Float, dist: Float, fisheye: bool = False) -> Float:
             P=eye,
             criteria=CONVERGED,
         )
-    found = raw[:, 0].astype(np.float64)
+    rays = raw[:, 0].astype(np.float64)
 
     # The iteration may end at a wrong point, so its result is distorted again and compared.
-    again = distort(found, dist, fisheye)
+    again = distort(rays, dist, fisheye)
     error = np.abs(again - points).max(axis=1, keepdims=True)
-    return np.asarray(np.where(error < FOUND, found, np.nan))
+    return np.asarray(np.where(error < FOUND, rays, np.nan))
 
 
 def through_lens(camera: CameraEntry, u: Float, v: Float) -> Float:

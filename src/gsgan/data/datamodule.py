@@ -403,10 +403,10 @@ class GsganData(LightningDataModule):
         for split in SPLITS[1:]:
             tested += self.splits.items[split].cameras
         train = self.dataset("train")
-        found = scene_info(
+        scene = scene_info(
             self.layout, self.splits, train, self.info_samples, tested
         )
-        return replace(found, face=self.face)
+        return replace(scene, face=self.face)
 
     @property
     def eval_names(self) -> tuple[str, ...]:
@@ -428,7 +428,7 @@ class GsganData(LightningDataModule):
         self.setup()
         return self._datasets[split]
 
-    def labelled(self, split: str) -> Subset[Frame]:
+    def select_labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
         dataset = self.dataset(split)
 
@@ -487,7 +487,7 @@ class GsganData(LightningDataModule):
         self, batch: Frame, device: torch.device, dataloader_idx: int
     ) -> Frame:
         """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
-        return batch.to(device, non_blocking=True).unpacked()
+        return batch.to(device, non_blocking=True).unpack()
 
     def _loader(
         self,

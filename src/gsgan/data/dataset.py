@@ -62,7 +62,7 @@ class ImageCache(LRUCache[Item, DecodedImage]):
 class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
-    With ``packed`` images, masks and labels stay bytes, see `Frame.unpacked`.
+    With ``packed`` images, masks and labels stay bytes, see `Frame.unpack`.
 
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
     undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
@@ -159,7 +159,7 @@ class CaptureDataset(Dataset[Frame]):
             labels=labels,
             unsure=unsure,
         )
-        return found if self.packed else found.unpacked()
+        return found if self.packed else found.unpack()
 
     def mask(self, index: int) -> tuple[Bytes, Bytes | None]:
         """The mask ``[H, W]`` of an item and its unsure pixels, 0..255; reads no image.
@@ -170,7 +170,7 @@ class CaptureDataset(Dataset[Frame]):
         # Resampled as `_load` does.
         item = self.items[index]
         fit = self._fitting(item)
-        mask, unsure = self._stored_mask(item)
+        mask, unsure = self._read_mask(item)
         mask = fit(mask, self.layout.pixels.mask_sampling == "nearest")
         if unsure is not None:
             unsure = fit(unsure, True)
@@ -230,7 +230,7 @@ class CaptureDataset(Dataset[Frame]):
         """The camera of the item's image: window and scale are in its K."""
         window = self.window(item)
         size = None if self.size is None else (self.size, self.size)
-        return self._entry(item).seen(window, size, lens=self.lens == "raw")
+        return self._entry(item).view_of(window, size, lens=self.lens == "raw")
 
     def _raw(self, camera: CameraEntry) -> bool:
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
@@ -253,7 +253,7 @@ class CaptureDataset(Dataset[Frame]):
         fit = self._fitting(item)
 
         # Mask and image as stored.
-        mask, unsure = self._stored_mask(item)
+        mask, unsure = self._read_mask(item)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
 
@@ -291,7 +291,7 @@ class CaptureDataset(Dataset[Frame]):
         chw = np.ascontiguousarray(image.transpose(2, 0, 1))
         return DecodedImage(chw, mask, labels, unsure)
 
-    def _stored_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
+    def _read_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
         """The mask of an item and its unsure pixels, as stored."""
         # Several files may make one mask; its size is checked once they are joined.
         rules = self.layout.pixels

@@ -23,8 +23,8 @@ from gsgan.data.validation import (
     drop_unseen,
     frames_of,
 )
-from gsgan.utils.errors import DataError, explained
-from gsgan.utils.frame_files import FrameFiles, entries, shifted_numbers
+from gsgan.utils.errors import DataError, explain
+from gsgan.utils.frame_files import FrameFiles, entries, find_shifts
 
 # Masks by camera and frame.
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
@@ -191,14 +191,14 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     calibration = found.calibration
     masks = {frame for files in found.masks.values() for frame in files}
     others = {"masks": masks, "landmarks": landmarks.p}
-    shifted = shifted_numbers(frames_of(found.images), others)
+    shifted = find_shifts(frames_of(found.images), others)
     notes = [*found.notes, *shifted]
     cause = None
     if shifted:
         cause = f"{root}: {shifted[0].removeprefix('doubtful: ')}"
 
     # Frames need a skeleton, and cameras must fit the skeletons.
-    with explained(cause):
+    with explain(cause):
         images = drop_frames(
             root, found.images, landmarks, found.poses, limits, notes
         )
@@ -211,7 +211,7 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     folders = {}
     for name in cameras:
         folders[name] = root / found.mask_folder.format(camera=name)
-    with explained(cause):
+    with explain(cause):
         images = drop_unmasked(images, found.masks, folders, limits, notes)
 
     # Labels of the images that are left; none at all is the same as a capture without labels.

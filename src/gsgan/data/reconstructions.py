@@ -80,7 +80,7 @@ class CalibratedImage(NamedTuple):
     centre: Float  # [3] of the camera
 
 
-def fixed_cameras(
+def merge_cameras(
     path: Path, views: Sequence[CalibratedImage], scale: float
 ) -> dict[str, CameraEntry]:
     """The cameras that took some images, by name.
@@ -138,7 +138,7 @@ def _namings(
     paths = [PurePosixPath(view.image.replace("\\", "/")) for view in views]
     stems = [path.stem for path in paths]
     if len({path.parent for path in paths}) == 1:
-        return [_grouped(stems, views)]
+        return [_group(stems, views)]
 
     # The folders that differ, the last one first; folders of different depths have their own names.
     ways = []
@@ -146,17 +146,17 @@ def _namings(
     if len({len(parts) for parts in folders}) == 1:
         for names in reversed(list(zip(*folders, strict=True))):
             if len(set(names)) > 1:
-                ways.append(_grouped(names, views))
+                ways.append(_group(names, views))
     else:
-        ways.append(_grouped([path.parent.name for path in paths], views))
+        ways.append(_group([path.parent.name for path in paths], views))
 
     # Folders of moments hold the images of all cameras.
     if len(set(stems)) < len(stems):
-        ways.append(_grouped(stems, views))
+        ways.append(_group(stems, views))
     return ways
 
 
-def _grouped(
+def _group(
     names: Sequence[str], views: Sequence[CalibratedImage]
 ) -> dict[str, list[CalibratedImage]]:
     """The images by name."""
@@ -241,18 +241,18 @@ def read_colmap(path: Path, scale: float) -> dict[str, CameraEntry]:
             _binary_lenses(lens_path) if binary else _text_lenses(lens_path)
         )
     except DAMAGE as error:
-        raise _damaged(lens_path, error) from None
+        raise _damage_error(lens_path, error) from None
     try:
         images = _binary_images if binary else _text_images
         views = list(images(image_path, lenses))
     except DAMAGE as error:
-        raise _damaged(image_path, error) from None
+        raise _damage_error(image_path, error) from None
     if not views:
         raise DataError(f"{image_path} lists no image")
-    return fixed_cameras(image_path, views, scale)
+    return merge_cameras(image_path, views, scale)
 
 
-def _damaged(path: Path, error: Exception) -> DataError:
+def _damage_error(path: Path, error: Exception) -> DataError:
     reason = str(error) or type(error).__name__
     return DataError(
         f"{path} is not a readable file of COLMAP ({reason}); export it again"
@@ -326,14 +326,14 @@ def _binary_lenses(path: Path) -> dict[int, Lens]:
     """By number, of records of number, model, width, height and parameters."""
     lenses = {}
     with path.open("rb") as stream:
-        (count,) = _unpacked(stream, "<Q")
+        (count,) = _unpack(stream, "<Q")
         for _ in range(count):
-            number, model, width, height = _unpacked(stream, "<iiQQ")
+            number, model, width, height = _unpack(stream, "<iiQQ")
             names = list(CAMERA_MODELS)
             name = (
                 names[model] if 0 <= model < len(names) else f"number {model}"
             )
-            parameters = _unpacked(stream, f"<{CAMERA_MODELS.get(name, 0)}d")
+            parameters = _unpack(stream, f"<{CAMERA_MODELS.get(name, 0)}d")
             where = f"{path}, camera {number}"
             lenses[number] = _lens(where, name, (height, width), parameters)
     return lenses
@@ -344,20 +344,20 @@ def _binary_images(
 ) -> Iterator[CalibratedImage]:
     """The images of records of number, pose, camera, name and points."""
     with path.open("rb") as stream:
-        (count,) = _unpacked(stream, "<Q")
+        (count,) = _unpack(stream, "<Q")
         for _ in range(count):
-            _, *pose, camera = _unpacked(stream, "<i7di")
+            _, *pose, camera = _unpack(stream, "<i7di")
 
             # The name ends with a zero byte.
             name = bytearray()
             while (byte := _read(stream, 1)) != b"\0":
                 name += byte
             yield _view(name.decode(), lenses, camera, pose)
-            (points,) = _unpacked(stream, "<Q")
+            (points,) = _unpack(stream, "<Q")
             stream.seek(POINT_BYTES * points, 1)
 
 
-def _unpacked(stream: BinaryIO, form: str) -> tuple[Any, ...]:
+def _unpack(stream: BinaryIO, form: str) -> tuple[Any, ...]:
     return struct.unpack(form, _read(stream, struct.calcsize(form)))
 
 
@@ -422,7 +422,7 @@ def read_nerfstudio(path: Path, scale: float) -> dict[str, CameraEntry]:
         R = (pose[:3, :3] @ OPENGL).T
         lens = _nerfstudio_lens(where, {**content, **frame})
         views.append(CalibratedImage(frame["file_path"], lens, R, pose[:3, 3]))
-    return fixed_cameras(path, views, scale)
+    return merge_cameras(path, views, scale)
 
 
 def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:

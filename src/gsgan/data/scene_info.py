@@ -178,7 +178,7 @@ def scene_info(
         body_file=None if body is None else body.file,
         betas=() if body is None else body.betas,
         train_cameras=names,
-        surface=_shared_surface(dataset, names, samples),
+        surface=_compare_cameras(dataset, names, samples),
         darkest=_darkest(dataset, samples),
         texture=_texture(dataset, samples),
         degrees_seen=degrees_seen(completed, centres),
@@ -238,7 +238,7 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
     """Pixels per metre at the person: minimum and maximum of the cameras' medians."""
     # A camera may see the person at many distances, so its median counts.
     medians = []
-    for indices in _sampled(dataset, samples):
+    for indices in _sample(dataset, samples):
         scales = []
         for index in indices:
             item = dataset.items[index]
@@ -254,7 +254,7 @@ def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
     return min(medians), max(medians)
 
 
-def _sampled(dataset: CaptureDataset, samples: int) -> list[list[int]]:
+def _sample(dataset: CaptureDataset, samples: int) -> list[list[int]]:
     """Indices of at most ``samples`` evenly spaced items of each camera."""
     # The indices of each camera's items.
     by_camera: dict[str, list[int]] = {}
@@ -273,7 +273,7 @@ def _darkest(dataset: CaptureDataset, samples: int) -> float:
     """The brightness in [0, 1] below which the darkest percent of the person's pixels lies."""
     # Brightness is that of the brightest channel: a saturated colour is not dark.
     brightness = []
-    for indices in _sampled(dataset, samples):
+    for indices in _sample(dataset, samples):
         for index in indices:
             frame = dataset[index]
             brightest_channel = frame.image.amax(1, keepdim=True)
@@ -286,15 +286,15 @@ def _texture(dataset: CaptureDataset, samples: int) -> float:
     """The mean texture of the person's pixels."""
     # Pixels nearer to the outline than this see it in their windows.
     kernel = np.ones((SIDE + 2, SIDE + 2), np.uint8)
-    found = [np.zeros(0)]
-    for indices in _sampled(dataset, samples):
+    textures = [np.zeros(0)]
+    for indices in _sample(dataset, samples):
         for index in indices:
             frame = dataset[index]
             solid = (frame.mask[0, 0] > SOLID).numpy().astype(np.uint8)
             inside = cv2.erode(solid, kernel, borderValue=0) > 0
             levels = grey(frame.image[0].permute(1, 2, 0).numpy())
-            found.append(texture(levels)[inside])
-    pixels = np.concatenate(found)
+            textures.append(texture(levels)[inside])
+    pixels = np.concatenate(textures)
     return float(pixels.mean()) if pixels.size else 0.0
 
 
@@ -324,7 +324,7 @@ def _body_inside(
     return float(np.mean(shares or [0.0]))
 
 
-def _shared_surface(
+def _compare_cameras(
     dataset: CaptureDataset,
     cameras: tuple[str, ...],
     samples: int,

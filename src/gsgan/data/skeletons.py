@@ -46,7 +46,7 @@ class Landmarks:
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
 
-    def seen(self, frame: int) -> Float:
+    def visible_joints(self, frame: int) -> Float:
         """``[N, 3]`` the visible joints of a frame."""
         return self.p[frame][self.visibility[frame] > 0]
 
@@ -330,9 +330,9 @@ def face_at_rest(
 
     # Medians over the frames that show them.
     unseen = ~seen[:, first:, None]
-    found = local.masked_fill(unseen, torch.nan).nanmedian(0).values
-    usual = constants(HOLISTIC, found.device, found.dtype).face_rest
-    rest = torch.where(found.isnan(), usual, found)
+    mean = local.masked_fill(unseen, torch.nan).nanmedian(0).values
+    usual = constants(HOLISTIC, mean.device, mean.dtype).face_rest
+    rest = torch.where(mean.isnan(), usual, mean)
     return tuple((x, y, z) for x, y, z in rest.tolist())
 
 

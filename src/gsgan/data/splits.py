@@ -90,10 +90,10 @@ class Items(Sequence[Item]):
         camera = self.cameras.index(name)
 
         # The place among the camera's own items.
-        found = np.flatnonzero(self._of[name] == frame)
-        if not len(found):
+        matches = np.flatnonzero(self._of[name] == frame)
+        if not len(matches):
             raise ValueError(f"{item} is not in the split")
-        return int(self._ends[camera] + found[0])
+        return int(self._ends[camera] + matches[0])
 
 
 class Sides(NamedTuple, Generic[NameOrNumber]):
@@ -327,11 +327,11 @@ def _items(
     """The cameras' images of the frames, those that exist."""
     # Both arrays are without repetitions.
     wanted = np.array(frames, np.int64)
-    found = {}
+    items = {}
     for camera in cameras:
         stored = layout.images[camera].frames
-        found[camera] = np.intersect1d(wanted, stored, assume_unique=True)
-    return Items(found)
+        items[camera] = np.intersect1d(wanted, stored, assume_unique=True)
+    return Items(items)
 
 
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:

@@ -77,7 +77,7 @@ def surface_colours(
         return None
 
     # By pair of cameras: the differences of colour at points that both see, frame by frame.
-    found: dict[tuple[int, int], list[Float]] = {}
+    samples: dict[tuple[int, int], list[Float]] = {}
     for frames in moments:
         points = _hull(frames)
         colours = [_colours(frame, points) for frame in frames]
@@ -86,12 +86,12 @@ def surface_colours(
             difference = colours[i] - colours[j]
             both = difference[~np.isnan(difference[:, 0])]
             if len(both) >= MIN_SHARED:
-                found.setdefault((i, j), []).append(both)
+                samples.setdefault((i, j), []).append(both)
 
     # The median is due to the cameras, the residual to highlights and errors of the hull.
     medians = []
     residuals = []
-    for differences in found.values():
+    for differences in samples.values():
         if len(differences) >= MIN_FRAMES:
             pair = np.concatenate(differences)
             median = np.median(pair, axis=0)

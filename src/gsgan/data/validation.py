@@ -158,7 +158,7 @@ def check_geometry(
         DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
     # All joints at once, which is faster than frame by frame.
-    frames, joints, valid = _seen(images, landmarks)
+    frames, joints, valid = _find_joints(images, landmarks)
 
     # A long capture is checked on some of its frames.
     some = slice(None, None, -(-len(frames) // MAX_CHECKED_FRAMES))
@@ -179,7 +179,7 @@ def check_geometry(
             )
 
 
-def _seen(
+def _find_joints(
     images: Images, landmarks: Landmarks
 ) -> tuple[list[int], NDArray[Any], NDArray[Any]]:
     """The frames of any camera ``[F]``, rising, their joints ``[F, J, 3]``, and ``[F, J]`` whether
@@ -229,7 +229,7 @@ def drop_unseen(
     """
     # Only cameras that lose an image get a new index.
     kept = dict(images)
-    frames, joints, valid = _seen(images, landmarks)
+    frames, joints, valid = _find_joints(images, landmarks)
     for name, files in images.items():
         if not files:
             continue

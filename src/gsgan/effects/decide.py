@@ -110,7 +110,7 @@ class EffectSettings:
                 f"effects.only must list some of {', '.join(CHOICES)}; got {listed}"
             )
 
-    def requested(self, name: str) -> str | int:
+    def value_of(self, name: str) -> str | int:
         """The value requested for an effect, with ``only`` taken into account."""
         # Without `only` every effect is as requested.
         value: str | int = getattr(self, name)
@@ -172,11 +172,11 @@ def decide(
     # Registration depends on whether Gaussians are on a body; all others decide by themselves.
     model = model or ModelParts()
     on_body = _one("body_points", info, settings, model)
-    found = {
+    effects = {
         name: _one(name, info, settings, model, on_body) for name in CHOICES
     }
-    cameras = info.train_cameras if found["colour_correction"].on else ()
-    return Effects(**found, cameras=cameras)
+    cameras = info.train_cameras if effects["colour_correction"].on else ()
+    return Effects(**effects, cameras=cameras)
 
 
 def _one(
@@ -187,7 +187,7 @@ def _one(
     body_points: Effect | None = None,
 ) -> Effect:
     # Off by request.
-    requested = settings.requested(name)
+    requested = settings.value_of(name)
     off: str | int = 0 if name == "view_dependence" else OFF
     if requested in (OFF, 0):
         return Effect(off, FORCED)

@@ -103,12 +103,12 @@ class Effects:
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
         """The inverse of `plain`."""
         # Checkpoints from before an effect existed lack it.
-        found = {
+        effects = {
             name: Effect(**values[name])
             for name in EFFECT_NAMES
             if name in values
         }
-        return cls(**found, cameras=tuple(values["cameras"]))
+        return cls(**effects, cameras=tuple(values["cameras"]))
 
     def check_same(self, stored: Mapping[str, Any]) -> None:
         """Refuses to resume a run that began with other effects, stored as `plain` gives them.

@@ -89,7 +89,7 @@ def write_scored(scored: Scored, folder: Path) -> None:
 # -- tables
 
 
-def shown_metrics(results: Results) -> list[str]:
+def list_metrics(results: Results) -> list[str]:
     """The metrics of the first tables, those that any split has."""
     finals = [variants[FULL] for variants in results.values()]
     return [
@@ -99,7 +99,7 @@ def shown_metrics(results: Results) -> list[str]:
     ]
 
 
-def formatted(values: Mapping[str, Any], metric: str, end: str = "") -> str:
+def format_score(values: Mapping[str, Any], metric: str, end: str = "") -> str:
     """A score, rounded to the digits of its metric; None is ``n/a``."""
     value = values.get(metric + end)
     if value is None:
@@ -116,40 +116,43 @@ def rows(
     """One formatted row per variant of a split, and below it one of the deviation over poses or,
     if ``cameras``, one per camera."""
     for variant, scores in variants.items():
-        yield [VARIANTS[variant], *(formatted(scores, x) for x in metrics)]
+        yield [VARIANTS[variant], *(format_score(scores, x) for x in metrics)]
         if cameras:
             for camera, means in scores["cameras"].items():
-                yield [f"  {camera}", *(formatted(means, x) for x in metrics)]
+                yield [
+                    f"  {camera}",
+                    *(format_score(means, x) for x in metrics),
+                ]
         elif any(f"{metric}_over_poses" in scores for metric in metrics):
-            cells = [formatted(scores, x, "_over_poses") for x in metrics]
+            cells = [format_score(scores, x, "_over_poses") for x in metrics]
             yield [f"  {OVER_POSES}", *cells]
 
 
 def notes(results: Results) -> list[str]:
     """Every reason and mark of the table, once each."""
     # Keys of a dictionary: each note once, in the order of the table.
-    found: dict[str, None] = {}
+    lines: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants[FULL]
-        found |= dict.fromkeys(_spread_notes(scores))
+        lines |= dict.fromkeys(_spread_notes(scores))
 
         # The inputs of the metrics, and marks.
         described = scores.get("lpips_input")
         if described:
-            found[f"LPIPS' networks get {described}"] = None
+            lines[f"LPIPS' networks get {described}"] = None
         boxes = scores.get("boxes")
         if boxes:
-            found[f"boxes: {boxes}"] = None
+            lines[f"boxes: {boxes}"] = None
         for mark in scores["marks"]:
-            found[f"marked: {mark}"] = None
+            lines[f"marked: {mark}"] = None
 
         # The protocol is the same for every split, and so is its note.
         if scores.get("protocol"):
-            found |= dict.fromkeys(_protocol_notes(scores["protocol"]))
+            lines |= dict.fromkeys(_protocol_notes(scores["protocol"]))
 
         # Why there is no score, by reason.
         if not scores["images"]:
-            found[f"{split}: {scores['psnr_reason']}"] = None
+            lines[f"{split}: {scores['psnr_reason']}"] = None
             continue
 
         # Metrics that lack for the same reason share a note.
@@ -160,8 +163,8 @@ def notes(results: Results) -> list[str]:
                     metric
                 )
         for reason, metrics in missing.items():
-            found[f"{', '.join(metrics)} n/a: {reason}"] = None
-    return list(found)
+            lines[f"{', '.join(metrics)} n/a: {reason}"] = None
+    return list(lines)
 
 
 def _spread_notes(scores: Mapping[str, Any]) -> list[str]:
@@ -185,7 +188,7 @@ def print_table(
     """Prints the table, its caption and its notes."""
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("image", no_wrap=True)
-    metrics = shown_metrics(results)
+    metrics = list_metrics(results)
     for metric in metrics:
         heading = METRICS[metric].short_heading
         table.add_column(heading, justify="right", no_wrap=True)
@@ -207,7 +210,7 @@ def print_table(
 def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The tables in Markdown with their caption: a few metrics for reading, then every metric, and
     the few by camera."""
-    metrics = shown_metrics(results)
+    metrics = list_metrics(results)
     headings = [METRICS[metric].short_heading for metric in metrics]
     first = []
     whole = ["## All metrics"]
@@ -222,7 +225,9 @@ def markdown(results: Results, origin: dict[str, Any]) -> str:
         # Every metric is a row, so that the table is narrow.
         lines = []
         for metric, described in METRICS.items():
-            cells = [formatted(scores, metric) for scores in variants.values()]
+            cells = [
+                format_score(scores, metric) for scores in variants.values()
+            ]
             lines.append([described.heading, *cells])
         names = [VARIANTS[variant] for variant in variants]
         whole += [f"**{split}**", pages.markdown(["metric", *names], lines)]

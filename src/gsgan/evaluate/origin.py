@@ -43,7 +43,7 @@ class Method:
     trained_by: list[str] | None = None
 
 
-def trained(folder: Path, **training: Any) -> Method:
+def read_method(folder: Path, **training: Any) -> Method:
     """The method of a run folder, with the fields of ``training``."""
     # The names in the run's config.
     chosen = choices(folder)
@@ -136,8 +136,8 @@ def _commit() -> tuple[str | None, bool | None]:
         return None, None
 
     # The description ends with the mark of local changes.
-    found = done.stdout.strip()
-    return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
+    commit = done.stdout.strip()
+    return commit.removesuffix(DIRTY) or None, commit.endswith(DIRTY)
 
 
 def caption(origin: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from gsgan.metrics.regions import (
     BACKGROUNDS,
     box_corners,
     box_mask,
-    cleared,
+    clear,
     eight_bits,
     hands_and_mouth,
     hard_outline,
@@ -90,10 +90,10 @@ class BodyBoxes:
 
     def __init__(self, data: GsganData) -> None:
         # A capture may have poses without a body, and the reverse.
-        found = data.layout.meta.body
+        meta = data.layout.meta.body
         self.body: SkinnedBody | None = None
-        if data.layout.poses is not None and found is not None:
-            self.body = open_body(found.kind, found.file, found.betas)
+        if data.layout.poses is not None and meta is not None:
+            self.body = open_body(meta.kind, meta.file, meta.betas)
 
     @property
     def departures(self) -> list[str]:
@@ -174,7 +174,7 @@ class Preparation:
         # Rounding, then clearing, as the scoring scripts do.
         image = eight_bits(image, self.measures.eight_bits)
         if box is not None and self.measures.region == "body_box_cleared":
-            image = cleared(image, box, background)
+            image = clear(image, box, background)
         return image
 
     def box(self, frame: Frame) -> Tensor | None:
@@ -294,7 +294,7 @@ def read_folder(
     # All files by their names without leading zeros of numbers.
     stored: dict[str, list[str]] = {}
     for name in sorted(glob("**", root_dir=root, recursive=True)):
-        stored.setdefault(_unpadded(name), []).append(name)
+        stored.setdefault(_strip_zeros(name), []).append(name)
 
     # Every expected image, once. All missing ones are counted before they are reported.
     files = {}
@@ -312,20 +312,20 @@ def read_folder(
 
             # Numbers are compared without their zeros: programs pad them
             # differently.
-            name = _filled(pattern, values)
-            found = stored.get(_unpadded(name), [])
-            if not found:
+            name = _fill_fields(pattern, values)
+            paths = stored.get(_strip_zeros(name), [])
+            if not paths:
                 missing.append(f"{what}, expected as {name}")
                 continue
-            if len(found) > 1:
+            if len(paths) > 1:
                 raise DataError(
-                    f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
+                    f"{root} has {what} twice, as {paths[0]} and {paths[1]}; keep one of them"
                 )
 
             # It must have the size of the ground truth.
-            files[camera, frame] = found[0]
+            files[camera, frame] = paths[0]
             truth = f"the ground truth of {what}, as scored,"
-            check_image(root / found[0], "image", size, truth)
+            check_image(root / paths[0], "image", size, truth)
 
     # The number of missing images, and the first of them.
     if missing:
@@ -336,12 +336,12 @@ def read_folder(
     return PredictionFolder(root, files, background)
 
 
-def _filled(pattern: str, values: Mapping[str, str]) -> str:
+def _fill_fields(pattern: str, values: Mapping[str, str]) -> str:
     """The pattern with every field replaced by its value."""
     return FIELD.sub(lambda field: values[field[1]], pattern)
 
 
-def _unpadded(name: str) -> str:
+def _strip_zeros(name: str) -> str:
     """The name with every number stripped of leading zeros."""
     # A number of zeros keeps one.
     return re.sub("[0-9]+", lambda digits: digits[0].lstrip("0") or "0", name)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
-from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 from rich.console import Console
@@ -25,6 +22,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import VALIDATION, Item, spread_items
 from gsgan.evaluate.align import PoseAlignment
+from gsgan.evaluate.distance import write_distances
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -36,7 +34,7 @@ from gsgan.evaluate.files import (
 )
 from gsgan.evaluate.grids import write_grid
 from gsgan.evaluate.kept import FOLDER, KeptScores
-from gsgan.evaluate.origin import Method, fingerprint, origin, trained
+from gsgan.evaluate.origin import Method, fingerprint, origin, read_method
 from gsgan.evaluate.predictions import (
     BodyBoxes,
     Prediction,
@@ -70,139 +68,7 @@ from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, track, working
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
-
-# The distances as a table with the scores `COLUMNS`, and as a figure.
-CSV = "distance.csv"
-PNG = "distance.png"
-COLUMNS = (
-    "psnr_person",
-    "psnr_person_shifted",
-    "ssim_person",
-    "lpips_vgg_person",
-    "lpips_alex_person",
-    "flicker",
-    "warped_flicker",
-)
-# Edges of the bins of distances.
-BINS = (0, 1, 2, 3, 4, 6, 8, 12, np.inf)
-
-
-class Bin(NamedTuple):
-    """A bin of distances from the training poses: its edges and the means of its images."""
-
-    low: float
-    high: float
-    distance: float
-    psnr: float  # dB
-    images: int
-
-
-def write_distances(
-    folder: Path,
-    rows: pd.DataFrame,
-    data: GsganData,
-    poses: TrainingPoses,
-    console: Console,
-    beside: Path | None = None,
-) -> None:
-    """Writes the scores of each final image with its pose's distance, and the curve of their means.
-
-    Args:
-        folder: of the scores.
-        rows: as in scores.csv.
-        data: that was scored.
-        poses: of the training.
-        console: prints the means in the person's box.
-        beside: a folder of scores on the training's own capture, whose curve is drawn as well.
-    """
-    # The distance of each frame's pose, by image.
-    table = rows.loc[
-        rows["variant"] == FULL, ["split", "camera", "frame", *COLUMNS]
-    ]
-
-    # Frames repeat in the table: the distance of each is computed once.
-    frames, places = np.unique(table["frame"], return_inverse=True)
-    skeletons = data.dataset("train").skeletons.p
-    p = np.stack([skeletons[frame] for frame in frames.tolist()])
-    distances = poses.distance(torch.from_numpy(p))
-    table.insert(3, "distance", distances.numpy()[places].round(3))
-    write_atomically(
-        folder / CSV, table.to_csv(index=False, lineterminator="\n")
-    )
-
-    # The curve, and the one of the training's own capture.
-    curves = {"scored here": table}
-    if beside is not None and (beside / CSV).is_file():
-        curves["held out of the training's capture"] = pd.read_csv(beside / CSV)
-    write_atomically(folder / PNG, _plot(curves))
-
-    # One sentence for the terminal.
-    parts = []
-    for own in _bins(table):
-        parts.append(
-            f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})"
-        )
-    means = "; ".join(parts)
-    text = f"PSNR in box by distance from the training poses, in deviations (images): {means}"
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _bins(table: pd.DataFrame) -> list[Bin]:
-    """The bins that hold images with a finite PSNR."""
-    # Images of equal pixels, or without a person, have no finite PSNR.
-    table = table[np.isfinite(table["psnr_person"])]
-
-    # The number of each image's bin, which contains its lower edge.
-    place = pd.cut(table["distance"], BINS, right=False, labels=False)
-    bins = []
-    for number, own in table.groupby(place):
-        k = int(number)
-        bins.append(
-            Bin(
-                low=BINS[k],
-                high=BINS[k + 1],
-                distance=own["distance"].mean(),
-                psnr=own["psnr_person"].mean(),
-                images=len(own),
-            )
-        )
-    return bins
-
-
-def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
-    """A PNG of PSNR over distance: a dot per image, a line through the means of the bins."""
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for label, table in curves.items():
-        bins = _bins(table)
-        x = [own.distance for own in bins]
-        y = [own.psnr for own in bins]
-
-        # The line through the means, then the images in its colour.
-        (drawn,) = axes.plot(x, y, "o-", label=label)
-        axes.plot(
-            table["distance"],
-            table["psnr_person"],
-            ".",
-            color=drawn.get_color(),
-            alpha=0.25,
-            markersize=3,
-        )
-
-    axes.set_xlabel(
-        "distance from the training poses, in their standard deviations"
-    )
-    axes.set_ylabel("PSNR in the person's box, dB")
-    axes.grid(alpha=0.3)
-    axes.legend()
-
-    # Made in memory, since files are written completely or not at all.
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=150)
-    return image.getvalue()
-
 
 # The splits that can be scored, and the mark of scores with drive=skeleton.
 HELD_OUT_SPLITS = ("novel_view", "novel_pose")
@@ -338,7 +204,7 @@ def evaluate_folder(
         out = out / f"of_{options.score_images}_images"
 
     # What facts.json states about the run.
-    method = trained(
+    method = read_method(
         folder,
         seed=stored.seed,
         iterations=state["step"],
@@ -470,19 +336,19 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
 
     # The method of the scores that the folder holds already.
     held = out / FACTS_FILE
-    found = method
+    stored = method
     if held.is_file():
         try:
-            found = json.loads(held.read_text())["method"]
+            stored = json.loads(held.read_text())["method"]
         except (ValueError, KeyError, TypeError):
             raise ConfigError(
                 f"{held} is damaged; choose another folder with out="
             ) from None
 
     # Scores of the same method are replaced.
-    if found != method:
+    if stored != method:
         raise ConfigError(
-            f"out={out} holds scores of {found}, not of {method}; choose another folder"
+            f"out={out} holds scores of {stored}, not of {method}; choose another folder"
         )
     return out
 
@@ -553,10 +419,10 @@ def evaluate_method(
         )
 
     # Only now, as everything is scored, files are written.
-    for split, found in scores.items():
-        if found.grid:
-            write_grid(found.grid, folder / "grids" / f"{split}.png")
-    joined = _joined_splits(scores, scorer, data, origin(method, data, device))
+    for split, split_scores in scores.items():
+        if split_scores.grid:
+            write_grid(split_scores.grid, folder / "grids" / f"{split}.png")
+    joined = _join_splits(scores, scorer, data, origin(method, data, device))
     print_table(joined.results, joined.origin, console)
     if poses is not None and not joined.rows.empty:
         write_distances(folder, joined.rows, data, poses, console, beside)
@@ -634,7 +500,7 @@ def _score(
     )
 
 
-def _joined_splits(
+def _join_splits(
     scores: dict[str, SplitScores],
     scorer: Scorer,
     data: GsganData,
@@ -648,15 +514,15 @@ def _joined_splits(
     # metrics.json by split, scores.csv by image.
     results: Results = {}
     rows = []
-    for split, found in scores.items():
-        held = found.variants
+    for split, split_scores in scores.items():
+        held = split_scores.variants
         if not held:
             reason = data.reasons.get(split, "no frames")
             held = {name: empty(reason, scorer) for name in variants}
         results[split] = {}
         for name, values in held.items():
             results[split][name] = values | {"protocol": scorer.protocol}
-        for variant, of_variant in found.rows.items():
+        for variant, of_variant in split_scores.rows.items():
             for row in of_variant:
                 rows.append({"split": split, "variant": variant, **row})
     return Scored(results, pd.DataFrame(rows, columns=HEADER), origin)

@@ -44,7 +44,7 @@ from gsgan.metrics.names import (
 )
 from gsgan.metrics.regions import (
     BACKGROUNDS,
-    cleared,
+    clear,
     describe_boxes,
     rectangle,
 )
@@ -121,8 +121,8 @@ def image_scores(
         scores["ssim"] = _inside(
             box,
             similarity,
-            cleared(image, box, background),
-            cleared(target, box, background),
+            clear(image, box, background),
+            clear(target, box, background),
         )
     else:
         scores["psnr"] = psnr(image, target, pooling=pooling)
@@ -500,10 +500,12 @@ class Tally:
         variants = {}
         for name, own in self.rows.items():
             if name == FULL:
-                found = _variant(own, self.matrices, self.no_parts, self.scorer)
+                variant = _variant(
+                    own, self.matrices, self.no_parts, self.scorer
+                )
             else:
-                found = _variant(own, {}, no_parts[name], self.scorer)
-            variants[name] = found
+                variant = _variant(own, {}, no_parts[name], self.scorer)
+            variants[name] = variant
         return SplitScores(variants, self.rows, self.grid)
 
 
@@ -549,10 +551,12 @@ def _variant(
     # The same by camera, without reasons.
     cameras = {}
     for camera in dict.fromkeys(row["camera"] for row in rows):
-        found = means([row for row in rows if row["camera"] == camera])
+        camera_means = means([row for row in rows if row["camera"] == camera])
         if camera in matrices:
-            found |= miou(matrices[camera])
-        cameras[camera] = {metric: found.get(metric) for metric in METRICS}
+            camera_means |= miou(matrices[camera])
+        cameras[camera] = {
+            metric: camera_means.get(metric) for metric in METRICS
+        }
     return result | {"cameras": cameras} | _common(scorer, len(rows))
 
 

@@ -184,7 +184,7 @@ def _number(value: float | None) -> str:
 def _read(path: Path) -> dict[str, Any]:
     # A run that has not been evaluated lacks these files.
     try:
-        found = json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

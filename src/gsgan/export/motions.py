@@ -41,7 +41,7 @@ class BodyMotion(NamedTuple):
     up: str  # axis of the world, e.g. "z"
 
 
-def captured_motion(root: Path, smpl: str | None, fps: float) -> BodyMotion:
+def read_captured(root: Path, smpl: str | None, fps: float) -> BodyMotion:
     """The body poses of a capture, with the fingers that hand landmarks show.
 
     Args:

@@ -113,7 +113,7 @@ def block(
 
     Args:
         run: the avatar's.
-        avatar: its `distilled` copy.
+        avatar: its copy by `distil`.
         motions: drives and their frames per second by name.
         name: the avatar's.
     """
@@ -128,7 +128,7 @@ def block(
     still = {"rest pose": (rest_pose(run.proportions), 1.0)}
     for i, (title, (drive, fps)) in enumerate((still | dict(motions)).items()):
         theta, transl = poses_of(avatar, drive)
-        arrays[f"theta{i}"], step = quantised(theta, 32767)
+        arrays[f"theta{i}"], step = quantise(theta, 32767)
         arrays[f"transl{i}"] = transl
         listed.append(
             {
@@ -155,7 +155,7 @@ def block(
     return zlib.compress(len(text).to_bytes(8, "little") + text + data, 9)
 
 
-def quantised(values: NDArray, maximum: int) -> tuple[NDArray, NDArray]:
+def quantise(values: NDArray, maximum: int) -> tuple[NDArray, NDArray]:
     """Whole numbers within ± ``maximum`` and their step; a matrix has one step per row."""
     size = np.abs(values)
     largest = (
@@ -194,8 +194,8 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     # whose other coefficients are all zero do not follow the normal and are left out.
     rows = table.permute(2, 1, 0).numpy()  # [numbers, 9, N]
     follow = np.flatnonzero(rows[:, 1:].any((1, 2)))
-    first, first_step = quantised(rows[:, 0], 32767)
-    others, steps = quantised(rows[follow, 1:].reshape(-1, len(table)), 127)
+    first, first_step = quantise(rows[:, 0], 32767)
+    others, steps = quantise(rows[follow, 1:].reshape(-1, len(table)), 127)
 
     # Positions at rest fill the range of 16 bits.
     means = points.means.numpy()
@@ -207,7 +207,7 @@ def gaussians_of(avatar: Avatar) -> tuple[Plain, Arrays]:
     weight = points.weights[1].detach().double().numpy()
     weight = weight / weight.sum(1, keepdims=True)
     slope_bone, slopes = slopes_of(on_body)
-    slope, slope_step = quantised(slopes.flatten(), 32767)
+    slope, slope_step = quantise(slopes.flatten(), 32767)
 
     # The header: bounds of the residuals in metres, and the settings of the rasteriser.
     settings = avatar.accuracy

@@ -21,8 +21,8 @@ from gsgan.export.hub import (
 from gsgan.export.motions import (
     BodyMotion,
     bvh_text,
-    captured_motion,
     motion_glb,
+    read_captured,
 )
 from gsgan.export.page import block, page, refuse_unsuitable
 from gsgan.export.splats import (
@@ -39,7 +39,7 @@ from gsgan.run.drive import (
     REST,
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
     inputs_of,
 )
@@ -87,14 +87,14 @@ def export_config(config: DictConfig) -> None:
     # With `verify` nothing is exported: a file is read for its marks.
     if config.verify is not None:
         path = Path(config.verify).expanduser()
-        found = verify(path)
+        problem = verify(path)
         state = (
             "marked as synthetic"
-            if found.synthetic
+            if problem.synthetic
             else "not marked as synthetic"
         )
         tell(f"{path.name}: {state}")
-        tell(found.summary())
+        tell(problem.summary())
         return
 
     # Options are checked before the run is loaded. Programs are made on the CPU, so
@@ -157,7 +157,7 @@ def _write_poses(
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     frames = track(range(len(drive.p)), "writing", console)
     if kind == "usd":
-        poses = (_posed(run, drive, i) for i in frames)
+        poses = (_pose_frame(run, drive, i) for i in frames)
         fps = float(config.fps)
         _write(out, usd_bytes(poses, fps, run.proportions.up))
         return
@@ -273,7 +273,7 @@ def _block(
         drive = _poses(replace(options, motion=motion), config, run)
         tell(drive.text)
         motions[Path(motion).stem] = drive, float(config.fps)
-    return block(run, distilled_of(options, run), motions, name)
+    return block(run, distil_run(options, run), motions, name)
 
 
 def _poses(options: MotionOptions, config: DictConfig, run: Run) -> Drive:
@@ -301,7 +301,7 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
     fps = float(above("fps", config.fps))
     if config.capture is not None:
         capture = Path(config.capture).expanduser()
-        return captured_motion(capture, config.data_smpl, fps)
+        return read_captured(capture, config.data_smpl, fps)
 
     # The body that the avatar moves with, whose poses are those of the motion or solved.
     run = Run.from_config(config, device="cpu")
@@ -321,7 +321,7 @@ def _motion(config: DictConfig, console: Console) -> BodyMotion:
 
 
 @torch.no_grad()
-def _posed(run: Run, drive: Drive, i: int) -> Splats:
+def _pose_frame(run: Run, drive: Drive, i: int) -> Splats:
     """The Gaussians of frame i."""
     p, visibility, body = inputs_of(run.avatar, drive, i)
     return splats_of(run.avatar, p, visibility > 0, body)
@@ -329,7 +329,7 @@ def _posed(run: Run, drive: Drive, i: int) -> Splats:
 
 def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
     """The content of a .ply, .splat, .spz or .glb file of frame i."""
-    splats = _posed(run, drive, i)
+    splats = _pose_frame(run, drive, i)
     if kind == "gltf":
         return glb_bytes(splats, run.proportions.up)
     if kind == "splat":

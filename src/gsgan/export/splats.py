@@ -74,7 +74,7 @@ def splats_of(
     Raises:
         ConfigError: when the avatar has no Gaussians (``image_to_image``).
     """
-    gaussians, sh, frames = _posed(avatar, p, valid, body)
+    gaussians, sh, frames = _pose(avatar, p, valid, body)
     assert gaussians.covariances is not None
 
     # Covariances are Σ = R diag(s²) Rᵀ. The eigenvectors may be mirrored; R is a rotation.
@@ -95,7 +95,7 @@ def _float32(values: Tensor) -> Float:
     return np.ascontiguousarray(values.float().cpu().numpy())
 
 
-def _posed(
+def _pose(
     avatar: Avatar,
     p: Tensor,
     valid: Tensor,

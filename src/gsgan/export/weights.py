@@ -13,7 +13,7 @@ from gsgan.run.runs import Run, avatar_of, marks_of
 from gsgan.run.shared import (
     ENTRIES,
     FACTS,
-    checked_config,
+    check_config,
     read_weights,
     refusing_damage,
 )
@@ -28,7 +28,7 @@ def facts_of(run: Run) -> dict[str, Any]:
     Raises:
         DataError: when the config names a class that is not one of gsgan's own configs.
     """
-    config = checked_config(run.folder, run.stored)
+    config = check_config(run.folder, run.stored)
     # The scene as plain values, with the fields that this version reads.
     facts = run.checkpoint | {"scene": asdict(run.scene)}
     return {
@@ -75,7 +75,7 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
 
     # A damaged config can fail anywhere in the building of the avatar.
     with refusing_damage(path):
-        config = checked_config(path, json.loads(metadata["config"]))
+        config = check_config(path, json.loads(metadata["config"]))
         checkpoint = {
             "gsgan": json.loads(metadata["gsgan"]),
             "state_dict": state,

@@ -39,28 +39,28 @@ class Fit:
     accuracy: Accuracy
 
     # Which poses are written, and which masks are used.
-    keep: bool = False
-    held_out: bool = False
-    min_mask: float = 0.1
+    keep: bool
+    held_out: bool
+    min_mask: float
 
     # The surface, and the numbers of steps, frames and cameras.
-    points: int = 3000
-    surface_steps: int = 150
-    sweeps: int = 15
-    frames: int = 60
-    cameras: int = 8
+    points: int
+    surface_steps: int
+    sweeps: int
+    frames: int
+    cameras: int
 
     # Weights of the priors, see `Fitter`.
-    noise: float = 0.02
-    landmarks: float = 0.02
-    prior: float = 0.005
-    loose: Sequence[int] = (*range(11), *range(17, 23))
+    noise: float
+    landmarks: float
+    prior: float
+    loose: Sequence[int]
 
     # Learning rates, and the share of the sweeps in which they stay.
-    angle_rate: float = 0.004
-    transl_rate: float = 0.0015
-    surface_rate: float = 0.01
-    hold: float = 0.4
+    angle_rate: float
+    transl_rate: float
+    surface_rate: float
+    hold: float
 
     def __post_init__(self) -> None:
         if self.accuracy is None:
@@ -125,7 +125,7 @@ class FittedSurface(nn.Module):
         self.offsets = nn.Parameter(torch.zeros(basis.shape[1]))
         self.log_scale = nn.Parameter(torch.zeros(()))
 
-    def posed(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
+    def pose(self, pose: BodyPose) -> tuple[Gaussians, Tensor]:
         """The Gaussians of a pose, and its landmarks ``[B, 33, 3]`` metres."""
         # points at rest, moved along their normals by at most `MAX_CLOTHES`, then with the bones
         bones = self.body.transforms(pose)
@@ -209,7 +209,7 @@ class Fitter:
         self.pose_optimiser = torch.optim.SparseAdam(
             self.moves.parameters(), settings.angle_rate, BETAS
         )
-        self.shaped = 0
+        self.body_of = 0
         self.swept = 0
 
     def pose(self, rows: Tensor | None = None) -> BodyPose:
@@ -226,7 +226,7 @@ class Fitter:
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""
         # The frame follows from the seed and the step.
-        chance = random.Random(f"{self.seed} surface {self.shaped}")
+        chance = random.Random(f"{self.seed} surface {self.body_of}")
         i = chance.randrange(len(self.start.theta))
         with torch.no_grad():
             pose = self.pose(torch.tensor([i]))
@@ -236,7 +236,7 @@ class Fitter:
         self.surface_optimiser.zero_grad()
         share.backward()  # type: ignore[no-untyped-call]
         self.surface_optimiser.step()
-        self.shaped += 1
+        self.body_of += 1
 
     def sweep(self) -> None:
         """One step on every frame, in random order."""
@@ -280,7 +280,7 @@ class Fitter:
         for i in range(len(poses.theta)):
             # The surface in this frame's pose.
             pose = BodyPose(poses.theta[i][None], poses.transl[i][None])
-            person, _ = self.surface.posed(pose)
+            person, _ = self.surface.pose(pose)
 
             # Unsure pixels do not count.
             ious = []
@@ -298,7 +298,7 @@ class Fitter:
 
     def _share(self, i: int, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
-        person, landmarks = self.surface.posed(pose)
+        person, landmarks = self.surface.pose(pose)
         wrong = []
         areas = []
 

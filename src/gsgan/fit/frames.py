@@ -89,7 +89,7 @@ class MaskedFrames:
             seeing = [
                 camera for camera in cameras if frame in layout.images[camera]
             ]
-            for camera in rotated(seeing, max_cameras, turn):
+            for camera in rotate_cameras(seeing, max_cameras, turn):
                 items.append((camera, frame))
 
         # Images at the data's own size and crop.
@@ -119,8 +119,8 @@ class MaskedFrames:
             by_frame[frame].append(place)
         self.frames = tuple(sorted(by_frame))
         self._places = by_frame
-        self.skeletons = self._stacked(layout.landmarks.p)
-        self.visibility = self._stacked(layout.landmarks.visibility)
+        self.skeletons = self._stack(layout.landmarks.p)
+        self.visibility = self._stack(layout.landmarks.visibility)
 
     def silhouettes(self, i: int) -> list[Silhouette]:
         """The masks of the i-th frame, one per camera."""
@@ -190,12 +190,12 @@ class MaskedFrames:
             place for place, area in enumerate(areas) if area >= minimum * usual
         ]
 
-    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
+    def _stack(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def rotated(
+def rotate_cameras(
     cameras: Sequence[str], maximum: int | None, turn: int
 ) -> list[str]:
     """At most so many cameras, evenly spaced; the next turn takes their neighbours."""

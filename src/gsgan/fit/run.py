@@ -17,9 +17,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor
 
-from gsgan.body import Body
 from gsgan.body.fingers import Fingers
-from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.shape import BodyShape, shape_body
 from gsgan.body.solve import ON_HANDS, Solver
 from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
@@ -34,6 +33,7 @@ from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
+from gsgan.fit.report import REPORT, fit_report, summary
 from gsgan.fit.shape import fit_hands, fit_offsets, fit_shape
 from gsgan.scene import BodyPose, cat
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
@@ -47,102 +47,6 @@ from gsgan.utils.files import (
     writing,
 )
 from gsgan.utils.tensors import pick_device
-
-REPORT = "body_fit.json"
-WORST = 5  # joints and frames named in the summary
-
-
-@torch.no_grad()
-def fit_report(
-    fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose
-) -> dict[str, Any]:
-    """Distances of landmarks from the skeletons in mm, and overlaps with the masks.
-
-    They are of three sets of poses; all overlaps are of the registered surface.
-
-    Args:
-        fitter: after the fit; its poses at the start were solved from the skeletons.
-        body: of the refined shape.
-        driven: the poses that were solved again, on ``body``, as held-out frames are.
-        found: the registered poses.
-    """
-    masked = fitter.frames
-    before = fitter.surface.body
-    visible = masked.visibility > 0
-
-    # medians of each set of poses
-    report: dict[str, Any] = {"frames": {}, "joints": {}}
-    distance = {}
-    overlap = {}
-    for name, of_body, pose in (
-        ("solved", before, fitter.start),
-        ("registered", before, found),
-        ("driven", body, driven),
-    ):
-        # Joints that were not seen have no distance.
-        metres = (of_body.posed_landmarks(pose) - masked.skeletons).norm(dim=-1)
-        distance[name] = torch.where(visible, 1000 * metres, torch.nan)
-        overlap[name] = fitter.overlap(pose)
-        report[name] = {
-            "residual_mm": float(distance[name].nanmedian()),
-            "iou": float(overlap[name].nanmean()),
-        }
-
-    # the same by joint and by frame
-    for j, joint in enumerate(MEDIAPIPE33.names):
-        report["joints"][joint] = _medians(distance, (slice(None), j))
-    for i, frame in enumerate(masked.frames):
-        report["frames"][str(frame)] = {
-            "residual_mm": _medians(distance, i),
-            "iou": _medians(overlap, i),
-        }
-
-    # the angles by which the masks turned the joints
-    turned = (found.theta - fitter.start.theta).norm(dim=-1).rad2deg()
-    report["turned_degrees"] = float(turned.quantile(0.95))
-    return report
-
-
-def _medians(values: dict[str, Tensor], at: Any) -> dict[str, float]:
-    """The median of a part of each set's values."""
-    return {
-        name: float(value[at].nanmedian()) for name, value in values.items()
-    }
-
-
-def summary(
-    report: dict[str, Any], folder: Path, masked: MaskedFrames
-) -> list[str]:
-    """The lines that the command prints."""
-    before = report["solved"]
-    after = report["registered"]
-
-    # the joints with the largest distances, and the frames with the smallest overlaps
-    distances = {
-        joint: x["registered"] for joint, x in report["joints"].items()
-    }
-    overlaps = {
-        frame: x["iou"]["registered"] for frame, x in report["frames"].items()
-    }
-    joints = sorted(
-        distances, key=lambda joint: -np.nan_to_num(distances[joint])
-    )
-    frames = sorted(overlaps, key=lambda frame: np.nan_to_num(overlaps[frame]))
-    worst = ", ".join(
-        f"{joint} {distances[joint]:.0f}" for joint in joints[:WORST]
-    )
-    lowest = ", ".join(
-        f"{frame} {overlaps[frame]:.3f}" for frame in frames[:WORST]
-    )
-    return [
-        f"{len(masked.frames)} frames, masks of {', '.join(masked.cameras)}: overlap (IoU) with "
-        f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
-        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {lowest}",
-        f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
-        f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
-        f"{folder} has {SHAPE} and {POSES_FILE}; {REPORT} has all numbers",
-    ]
-
 
 SIZE = 128  # pixels of the images that the fit before training uses
 PERSON_MARGIN = 0.2  # metres around the person in the images of a fit
@@ -262,7 +166,7 @@ def fit_body(
     refuse_swapped_sides(layout, data.trained)
 
     # the frames with a person in their masks
-    frames = _masked_frames(data, settings, device, console)
+    frames = _read_masks(data, settings, device, console)
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     # the shape and the poses by the skeletons
@@ -272,18 +176,18 @@ def fit_body(
         start = _solve_with_fingers(data, shape, frames.frames)
 
     # the poses by the masks, and with them the places of the landmarks
-    fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
-    found = _registered(fitter, settings, console)
+    fitter = Fitter(settings, frames, shape_body(shape), start, seed)
+    found = _register(fitter, settings, console)
     with torch.no_grad():
         registered = found.to(torch.device("cpu"))
-        shape = _refined(data, shape, frames.frames, registered)
+        shape = _refine_shape(data, shape, frames.frames, registered)
 
     # all poses by the skeletons again
     poses = {False: _solve_all(data, shape, console)}
     if layout.hands is not None:
         poses[True] = _solve_all(data, shape, console, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
-    report = fit_report(fitter, shaped_body(shape).to(device), driven, found)
+    report = fit_report(fitter, shape_body(shape).to(device), driven, found)
     report["settings"] = asdict(settings)
 
     # the files, and what they say
@@ -309,7 +213,7 @@ def _keeps(settings: Fit) -> bool:
     return settings.held_out or settings.keep
 
 
-def _masked_frames(
+def _read_masks(
     data: GsganData, settings: Fit, device: torch.device, console: Console
 ) -> MaskedFrames:
     """The frames that are registered, with the progress of reading their masks."""
@@ -330,7 +234,7 @@ def _masked_frames(
     return frames
 
 
-def _registered(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
+def _register(fitter: Fitter, settings: Fit, console: Console) -> BodyPose:
     """The poses after all steps of the fit."""
     # The surface comes first, in the solved poses; surface and poses follow together.
     with progress(console) as bars:
@@ -432,7 +336,7 @@ def _solve(
     try:
         with torch.no_grad():
             joints, visibility = _joints(data, frames, hands)
-            return Solver(shaped_body(shape)).solve(joints, visibility)
+            return Solver(shape_body(shape)).solve(joints, visibility)
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
         raise DataError(
@@ -476,11 +380,11 @@ def _by_hands(data: GsganData) -> bool:
 
 
 def _fingers(shape: BodyShape) -> list[int]:
-    names = shaped_body(shape).joint_names
+    names = shape_body(shape).joint_names
     return [i for i, name in enumerate(names) if name.startswith("finger")]
 
 
-def _refined(
+def _refine_shape(
     data: GsganData,
     shape: BodyShape,
     frames: Sequence[int],
@@ -504,7 +408,7 @@ def _refined(
 
     # the offsets of those of the 33 landmarks that are on placed hands
     body = len(MEDIAPIPE33.names)
-    placed = Fingers.placed(seen[:, body:] > 0)
+    placed = Fingers.has_palms(seen[:, body:] > 0)
     used = torch.zeros(len(p), body)
     for side, rows in enumerate(ON_HANDS):
         used[:, rows] = seen[:, rows] * placed[:, [side]]

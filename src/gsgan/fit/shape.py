@@ -17,7 +17,7 @@ from gsgan.body.shape import (
     BodyShape,
     ShapeSpace,
     free_space,
-    shaped_body,
+    shape_body,
 )
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
@@ -120,7 +120,7 @@ def fit_hands(
         return shape
 
     # The size is the ratio of the person's lengths to the body's.
-    own = shaped_body(shape).hand_landmarks
+    own = shape_body(shape).hand_landmarks
     own_length = (own[last] - own[first]).norm(dim=-1)
     size = length[known].sum() / own_length[known].sum()
     stretch = shape.stretch.clone()
@@ -128,12 +128,12 @@ def fit_hands(
     shape = replace(shape, stretch=stretch)
 
     # the hands in each frame, by landmarks other than the wrists
-    body = shaped_body(shape)
+    body = shape_body(shape)
     wrists = [WRIST, HAND + WRIST]
     fingers = Fingers(body)
     beyond = seen.clone()
     beyond[:, wrists] = False
-    found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
+    fingers_found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
 
     # The wrist landmark at rest, as it moves with the forearm and as it moves with the hand: the
     # wrist joint goes to the former, and the hand moves by the difference.
@@ -141,10 +141,12 @@ def fit_hands(
     on_arm = _at_rest(
         forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists]
     )
-    in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
+    in_hand = _at_rest(
+        fingers_found.rotations, fingers_found.shifts, hands[:, wrists]
+    )
 
     # The medians over frames that show the hand with its forearm.
-    usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
+    usable = fingers.has_palms(seen) & (visibility[:, FOREARMS] > 0).all(-1)
     on_arm = _median(on_arm, usable.unsqueeze(-1))
     in_hand = _median(in_hand, usable.unsqueeze(-1))
 
@@ -174,7 +176,7 @@ def fit_offsets(
         visibility: ``[F, 33]``; landmarks at 0 are not used.
     """
     # The landmarks in the person's skeletons, moved back to the rest pose.
-    body = shaped_body(shape)
+    body = shape_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
     moved = (
         _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons)
@@ -320,7 +322,7 @@ def _fit_lengths(
 
     # The logarithm of each distance against the target's, in standard deviations.
     def residual(x: Tensor) -> Tensor:
-        q = space.shaped(shape_of(space, x)).landmarks
+        q = space.body_of(shape_of(space, x)).landmarks
         return ((q[a] - q[b]).norm(dim=-1).log() - target) / sigma
 
     prior = shape_prior(space)
@@ -379,7 +381,7 @@ def _fit_landmarks(
     for _ in range(STEPS):
         # the poses of the current shape, and their normal equations
         with torch.no_grad():
-            solver = Solver(space.shaped(shape_of(space, x)))
+            solver = Solver(space.body_of(shape_of(space, x)))
             weight = solver.weights(seen)
             q, root = solver.guess(p) if held is None else held
             q, root = solver.descend(
@@ -390,7 +392,7 @@ def _fit_landmarks(
             _, g, H, w = solver.normal(q, at, weight)
 
         # derivatives of the posed landmarks by the shape
-        posed = partial(_posed, space, solver, q, root)
+        posed = partial(_pose, space, solver, q, root)
         by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
         transforms = solver.transforms(q, root, solver.joints)
         by_offsets = transforms[:, solver.carrier, :3, :3] @ symmetric
@@ -415,7 +417,7 @@ def _fit_landmarks(
     return shape_of(space, x)
 
 
-def _posed(
+def _pose(
     space: ShapeSpace[B],
     solver: Solver,
     q: Tensor,
@@ -425,7 +427,7 @@ def _posed(
 ) -> Tensor:
     """The landmarks ``[F, 33, 3]`` of a shape in poses."""
     # The body of this shape, and its bones in the poses.
-    body = space.shaped(shape_of(space, torch.cat([own, offsets])))
+    body = space.body_of(shape_of(space, torch.cat([own, offsets])))
     transforms = solver.transforms(q, root, body.joints)
     return solver.points(transforms, body.landmarks.nan_to_num())
 

@@ -14,7 +14,7 @@ from gsgan.weights.networks import (
     MIN_PIXELS,
     FeatureNetwork,
     Lpips,
-    pretrained,
+    load_pretrained,
 )
 
 FEATURES = "features"
@@ -97,7 +97,7 @@ class Perceptual(nn.Module):
         elif form == LPIPS:
             self.network = Lpips(net, path)
         else:
-            self.network = pretrained(net, path)
+            self.network = load_pretrained(net, path)
             if net == "vgg":
                 self.network.stages = self.network.stages[:VGG_LAYERS]
         if crop is not None:

@@ -111,7 +111,7 @@ def photometric(
     target = without_unsure(target, image, unsure)
 
     # On a CPU, all terms in one pass.
-    if _compiled(image, target):
+    if _can_compile(image, target):
         return _Photometric.apply(image, target, l1, l2, ssim)  # type: ignore[no-any-return]
 
     # The sum of the terms, without those that have no weight.
@@ -126,7 +126,7 @@ def photometric(
     return loss
 
 
-def _compiled(image: Tensor, target: Tensor) -> bool:
+def _can_compile(image: Tensor, target: Tensor) -> bool:
     """Whether the compiled loss is used: on a CPU, for float32 and float64 images."""
     return (
         image.device.type == "cpu"

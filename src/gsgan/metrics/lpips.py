@@ -79,15 +79,15 @@ class LpipsAgainst:
 
         # The ground truth's features, of the whole image and of the square.
         behind = torch.full_like(target, BACKGROUNDS[self.measures.background])
-        background = self._seen(behind)
-        whole = self._seen(target)
+        background = self._to_input(behind)
+        whole = self._to_input(target)
         square = self._square(target)
         self.backgrounds = {}
         self.truth = {}
         self.square_truth = {}
         for net, network in networks.items():
             network.to(target.device)
-            normalised = network.network.normalised
+            normalised = network.network.normalise
             self.backgrounds[net] = network.background(normalised(background))
             self.truth[net] = self.backgrounds[net].differing(normalised(whole))
             if square is not None:
@@ -101,7 +101,7 @@ class LpipsAgainst:
             ``{"lpips_<net>": score, "lpips_<net>_person": score}``; the latter is the mean of the
             distance's map in the person's box, with receptive fields that reach beyond it.
         """
-        whole = self._seen(image)
+        whole = self._to_input(image)
         square = self._square(image)
         scores = {}
         for net, network in self.networks.items():
@@ -136,7 +136,7 @@ class LpipsAgainst:
         background, and computed elsewhere."""
         background = self.backgrounds[net]
         truth = self.truth[net]
-        own = background.differing(self.networks[net].network.normalised(image))
+        own = background.differing(self.networks[net].network.normalise(image))
         shown = list(filter(None, (own, truth)))
         if not shown:
             return [torch.zeros_like(x[:, :1]) for x in background.maps]
@@ -163,7 +163,7 @@ class LpipsAgainst:
             for layer, beyond in zip(layers, padding, strict=True)
         ]
 
-    def _seen(self, image: Tensor) -> Tensor:
+    def _to_input(self, image: Tensor) -> Tensor:
         """The image with the protocol's channels and range, as the networks get it."""
         # Some published scores are of images whose channels were swapped.
         if self.measures.lpips_channels == "bgr":
@@ -183,4 +183,4 @@ class LpipsAgainst:
         # The square is filled with the background.
         background = BACKGROUNDS[self.measures.background]
         square = mask_crop(image[0], self.mask[0], background)
-        return None if square is None else self._seen(square[None])
+        return None if square is None else self._to_input(square[None])

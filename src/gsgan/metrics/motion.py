@@ -70,8 +70,8 @@ def truth_motion(
 
     # What one of the frames does not show does not return to its start.
     places = start + back
-    missed = np.linalg.norm(back + _moved(forth, places), axis=-1)
-    there = _moved(mask_before[0, 0].cpu().numpy(), places)
+    missed = np.linalg.norm(back + _move(forth, places), axis=-1)
+    there = _move(mask_before[0, 0].cpu().numpy(), places)
     person = np.maximum(mask[0, 0].cpu().numpy(), there) >= 0.5
     return Motion(places, person & (missed <= FLOW_TOLERANCE))
 
@@ -92,7 +92,7 @@ def warped_flicker(
     """
     if not motion.known.any():
         return math.nan
-    moved = _moved(_as_array(error_before), motion.places)
+    moved = _move(_as_array(error_before), motion.places)
     change = np.abs(_as_array(error) - moved).mean(axis=-1)
     return float(change[motion.known].mean())
 
@@ -110,7 +110,7 @@ def _as_array(image: Tensor) -> Values:
     return values.float().cpu().numpy()
 
 
-def _moved(values: Values, places: Values) -> Values:
+def _move(values: Values, places: Values) -> Values:
     """``[H, W]`` or ``[H, W, C]`` values at places, interpolated; the border's beyond it."""
     moved = cv2.remap(
         values,

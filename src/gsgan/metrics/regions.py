@@ -57,7 +57,7 @@ def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
     return (steps + CUT_SLACK).floor() / 255
 
 
-def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
+def clear(image: Tensor, keep: Tensor, background: float) -> Tensor:
     """An image with the background at pixels where ``keep`` is false."""
     return torch.where(keep, image, image.new_tensor(background))
 

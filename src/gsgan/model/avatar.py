@@ -16,10 +16,14 @@ from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
-from gsgan.model.painted import painted_window
+from gsgan.model.painted import find_window
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
-from gsgan.model.residual_gaussians import ResidualGaussians, Residuals, bounded
+from gsgan.model.residual_gaussians import (
+    ResidualGaussians,
+    Residuals,
+    clamp_soft,
+)
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.scene import (
@@ -45,14 +49,14 @@ from gsgan.skeleton import (
 )
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.splat import Accuracy, rasterise
-from gsgan.utils.tensors import filled, full_precision
+from gsgan.utils.tensors import fill, full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
 # entering it costs next to nothing
 UNWATCHED: AbstractContextManager[None] = nullcontext()
 
 
-def unwatched(stage: str) -> AbstractContextManager[None]:
+def watch_nothing(stage: str) -> AbstractContextManager[None]:
     """The context of a stage while no bench times it."""
     return UNWATCHED
 
@@ -151,7 +155,7 @@ class Avatar(nn.Module):
 
     # Replaced by benches: the context in which each stage runs, by its name.
     stage: Callable[[str], AbstractContextManager[None]] = staticmethod(
-        unwatched
+        watch_nothing
     )
 
     def __init__(
@@ -244,7 +248,7 @@ class Avatar(nn.Module):
         if self.generator is None and self.deformation is not None:
             self.deformation.active_features = 0
 
-        # Every part gets a store, in which `gsgan.utils.tensors.derived` keeps its results.
+        # Every part gets a store, in which `gsgan.utils.tensors.derive` keeps its results.
         for part in self.modules():
             part.derived = {}  # type: ignore[assignment]
         return self.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -294,7 +298,7 @@ class Avatar(nn.Module):
         rendering = self(p, seen, cameras.to("cpu"), body, maps=False)
         assert rendering.image is not None
         assert rendering.alpha is not None
-        colour = filled(background, rendering.image).expand(3).view(1, 3, 1, 1)
+        colour = fill(background, rendering.image).expand(3).view(1, 3, 1, 1)
         image = rendering.image.clamp(0, 1)
         return (image + (1 - rendering.alpha.clamp(0, 1)) * colour).clamp(0, 1)
 
@@ -335,10 +339,10 @@ class Avatar(nn.Module):
         """
         # The body and the window need values, so they are found before the transfer to the device.
         device = next(self.parameters()).device
-        prepared = self.prepared(
+        prepared = self.prepare(
             skeleton, visibility, camera, body, camera_index
         )
-        rendering, painted = self._rendered(
+        rendering, painted = self._render(
             prepared.to(device),
             pose_noise=pose_noise,
             generate=generate,
@@ -356,9 +360,9 @@ class Avatar(nn.Module):
         if window is None:
             return rendering
         with self.stage("paste"):
-            return rendering.pasted(window)
+            return rendering.paste(window)
 
-    def prepared(
+    def prepare(
         self,
         skeleton: Tensor,
         visibility: Tensor,
@@ -399,7 +403,7 @@ class Avatar(nn.Module):
                 skeleton, camera, margin=margin, near=near, **sides
             )
 
-    def _rendered(
+    def _render(
         self,
         prepared: Prepared,
         *,
@@ -416,18 +420,18 @@ class Avatar(nn.Module):
         camera_index = prepared.camera_index
         raster = S = image = alpha = painted = None
         with full_precision(camera.K.device):
-            posed = self._posed(
+            posed = self._pose(
                 prepared.skeleton, prepared.visibility > 0, prepared.body
             )
 
             # Step I's part: Ĝ and its splatted features F.
             gaussians = self.splat(posed, camera, pose_noise, reach)
             if gaussians is not None:
-                raster = self._rasterised(gaussians, camera, supersample)
+                raster = self._rasterise(gaussians, camera, supersample)
 
             # The generator paints where something was splatted, and has other inputs.
             if generate and self.generator is not None:
-                painted = None if raster is None else self._painted(raster)
+                painted = None if raster is None else self._find_window(raster)
                 if painted is not None and raster is not None:
                     raster = painted.raster(raster)
                     camera = painted.camera(camera)
@@ -436,7 +440,7 @@ class Avatar(nn.Module):
         # Sec. 3.5: the pose code and the UNet run in the precision of the trainer.
         if generate and self.generator is not None:
             S = inputs.S
-            generated = self._generated(inputs, raster).to(posed.p.dtype)
+            generated = self._generate(inputs, raster).to(posed.p.dtype)
             image = generated[:, :3]
             alpha = generated[:, 3:]
 
@@ -454,12 +458,12 @@ class Avatar(nn.Module):
 
         # Step I's colour and I_pred take on the tint of the training camera.
         if self.colour is not None and camera_index is not None:
-            rendering = self._corrected(
+            rendering = self._correct_colours(
                 rendering, raster, self.colour, camera_index
             )
         return rendering, painted
 
-    def _posed(
+    def _pose(
         self, p: Tensor, valid: Tensor, body: BodyPose | None
     ) -> PosedPerson:
         """Poses with the frames and bones that the avatar's parts read."""
@@ -509,7 +513,7 @@ class Avatar(nn.Module):
             )
         return GeneratorInputs(S, drawn, pose)
 
-    def _generated(
+    def _generate(
         self, inputs: GeneratorInputs, raster: Raster | None
     ) -> Tensor:
         """``[B, 4, H, W]`` I_pred and its alpha."""
@@ -530,7 +534,7 @@ class Avatar(nn.Module):
             generated: Tensor = self.generator(S=inputs.S, g=g, **maps)
         return generated
 
-    def _painted(self, raster: Raster) -> Window | None:
+    def _find_window(self, raster: Raster) -> Window | None:
         """The part of the images that the generator paints; None means all.
 
         On a GPU this is all, since reading the part would make the host wait; in training too, for
@@ -544,7 +548,7 @@ class Avatar(nn.Module):
             or torch.compiler.is_compiling()
         ):
             return None
-        return painted_window(
+        return find_window(
             raster.alpha,
             margin=self.generator_margin,
             multiple=self.window_multiple,
@@ -570,7 +574,7 @@ class Avatar(nn.Module):
             points = self.points(posed)
             chosen = None
             if reach is not None:
-                chosen = seen_points(points.means, camera, reach)
+                chosen = select_visible(points.means, camera, reach)
             with self.stage("Ψ"):  # Sec. 3.3: Ĝ = G + Ψ(p)
                 gaussians = self.deformation(
                     posed.p,
@@ -588,7 +592,7 @@ class Avatar(nn.Module):
         if bound is None:
             return gaussians  # type: ignore[no-any-return]
         return replace(
-            gaussians, features=bounded(gaussians.features, -bound, bound)
+            gaussians, features=clamp_soft(gaussians.features, -bound, bound)
         )
 
     def _face_code(self, posed: PosedPerson) -> Tensor | None:
@@ -610,7 +614,7 @@ class Avatar(nn.Module):
     ) -> tuple[Points, Residuals]:
         """G in pose and Ψ's ΔG without noise; arguments as for `PosedPerson`."""
         assert self.deformation is not None
-        posed = self._posed(p, valid, body)
+        posed = self._pose(p, valid, body)
         points = self.points(posed)
         code = self._code(posed)
         return points, self.deformation.residuals(points, code, root_of(p))
@@ -628,11 +632,11 @@ class Avatar(nn.Module):
         """Stores the spread of training poses in Ψ; arguments as for `PosedPerson`."""
         if isinstance(self.deformation, Deformation):
             # The means give the places of the anchors in the training poses.
-            posed = self._posed(p, valid, body)
+            posed = self._pose(p, valid, body)
             means = self.points(posed).means
             self.deformation.store_poses(self._code(posed), means, root_of(p))
 
-    def _rasterised(
+    def _rasterise(
         self, gaussians: Gaussians, camera: Camera, supersample: bool
     ) -> Raster:
         """F."""
@@ -646,7 +650,7 @@ class Avatar(nn.Module):
                 backend=self.backend,
             )
 
-    def _corrected(
+    def _correct_colours(
         self,
         rendering: Rendering,
         raster: Raster,
@@ -668,7 +672,7 @@ class Avatar(nn.Module):
 
 
 @torch.no_grad()
-def seen_points(means: Tensor, camera: Camera, reach: float) -> Tensor:
+def select_visible(means: Tensor, camera: Camera, reach: float) -> Tensor:
     """``[B, M]`` numbers of the points ``[B, N, 3]`` that are within reach of what a camera sees.
 
     Items with fewer than M such points have others as well.

@@ -17,16 +17,16 @@ from gsgan.body import (
     forward_kinematics,
     skin,
 )
-from gsgan.body.lbs import stretched
+from gsgan.body.lbs import stretch_jacobian
 from gsgan.body.skinned import WeightGradients, vertex_normals
-from gsgan.body.subdivide import subdivided
+from gsgan.body.subdivide import subdivide
 from gsgan.model import compiled
 from gsgan.model.interpolation import Interpolation
 from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, at_least, whole
-from gsgan.utils.tensors import derived, farthest_points, matvec, squared_norm
+from gsgan.utils.tensors import derive, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
 NORMAL_FLOOR = 1e-2
@@ -147,7 +147,7 @@ class LearntWeights(nn.Module):
         self._interpolate = Interpolation()
         self._interpolate_field = Interpolation()
 
-    def interpolated(self, values: Tensor) -> Tensor:
+    def interpolate(self, values: Tensor) -> Tensor:
         """``[N, C]`` values of the controls ``[A, C]`` at the points."""
         return self._interpolate(values, self.near, self.share)
 
@@ -162,7 +162,7 @@ class LearntWeights(nn.Module):
             )
             return (self.start + moved.view_as(self.start)).softmax(1)
 
-        return derived(self, "weights", make, self.field)
+        return derive(self, "weights", make, self.field)
 
 
 class SkinnedPoints(nn.Module):
@@ -285,7 +285,7 @@ class SkinnedGaussians(nn.Module):
         logit = math.log(opacity / (1 - opacity))
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
 
-    def deformed(
+    def deform(
         self,
         A: Tensor,
         means: Tensor,
@@ -303,7 +303,7 @@ class SkinnedGaussians(nn.Module):
             ) * log_scales.exp().unsqueeze(-2)
 
         # Covariances A Σ Aᵀ, from the transformed axes.
-        axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
+        axes = A @ derive(self, "axes", make, *self.parameters(recurse=False))
         opacities = torch.sigmoid(logits).expand(len(A), -1)
         return Gaussians(
             means, None, None, opacities, features, covariances=axes @ axes.mT
@@ -327,7 +327,7 @@ class BodyPoints(nn.Module):
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
         mean_step: of Ψ: its means move by this share of what they would on a skeleton's points.
         stretch: shapes and normals also follow the stretch of the surface, see
-            `gsgan.body.lbs.stretched`.
+            `gsgan.body.lbs.stretch_jacobian`.
         stretch_limit: how much longer the stretch makes a Gaussian at most, as a share of its
             length; None: no limit.
         stretch_every: iterations of training between updates of the stretch's terms, which change
@@ -371,7 +371,7 @@ class BodyPoints(nn.Module):
             points = points_for(stature, scale, spacing)
         if points is not None:
             points = whole("model.body_points.points", points, 1)
-            body = subdivided(body, points)
+            body = subdivide(body, points)
 
         # The points, and how Ψ learns with them.
         above("model.body_points.sigma", sigma)
@@ -437,7 +437,7 @@ class BodyPoints(nn.Module):
         return scale * float(self.points.spacing.median())
 
     def stretch_terms(self) -> tuple[Tensor, Tensor]:
-        """Bones and slopes of `gsgan.body.lbs.stretched`, of the weights that move the means."""
+        """Bones and slopes of `gsgan.body.lbs.stretch_jacobian`, for the means' weights."""
         learnt = self.points.learnt
         if learnt is None:
             return self.own_bones, self.own_slopes
@@ -447,7 +447,7 @@ class BodyPoints(nn.Module):
 
         # A trained avatar computes the terms once for its weights.
         if not self.training:
-            return derived(self, "terms", make, learnt.field)
+            return derive(self, "terms", make, learnt.field)
 
         # In training the terms are kept for `stretch_every` iterations and have no gradient.
         if self._terms is None or self._age == self.stretch_every:
@@ -478,7 +478,7 @@ class BodyPoints(nn.Module):
         bones = self.points.with_bones(pose).bones
         assert bones is not None
         terms = self.stretch_terms() if self.stretch else None
-        means, A, t, jacobian, normals = self._skinned(bones, terms)
+        means, A, t, jacobian, normals = self._skin(bones, terms)
         offset = self.offset(pose)
         if offset is not None:
             means = means + matvec(A, offset)
@@ -501,19 +501,19 @@ class BodyPoints(nn.Module):
         learnt = self.points.learnt
         if self.offsets is None or learnt is None:
             return None
-        found: Tensor = self.offsets(
-            pose.theta, learnt.interpolated, pose.offsets
+        offsets: Tensor = self.offsets(
+            pose.theta, learnt.interpolate, pose.offsets
         )
-        return found
+        return offsets
 
-    def _skinned(
+    def _skin(
         self, bones: Tensor, terms: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
         """Means, frames, origins, Jacobians and normals; in compiled code if it can be used."""
         weights = self.points.weights
         rest = self.points.means
         if compiled.has_skinned(bones, weights[1]):
-            return compiled.skinned(
+            return compiled.skin_points(
                 bones,
                 rest,
                 self.rest_normals,
@@ -533,8 +533,10 @@ class BodyPoints(nn.Module):
         # Shapes and normals follow the stretch of the surface.
         jacobian = None
         if terms is not None:
-            jacobian = stretched(A, bones, rest, *terms, self.stretch_limit)
-        normals = moved_normals(
+            jacobian = stretch_jacobian(
+                A, bones, rest, *terms, self.stretch_limit
+            )
+        normals = move_normals(
             A if jacobian is None else jacobian, self.rest_normals
         )
         return means, A, t, jacobian, normals
@@ -572,7 +574,7 @@ def points_per_pixel(count: int, stature: float, scale: float) -> float:
     return 4 * count / (area * scale**2)
 
 
-def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
+def move_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 
     Normals are transformed by the cofactors of A, det(A) A⁻ᵀ without the division. Where skinning

@@ -1,7 +1,7 @@
 """Points on a skinned body, and the geometry of Ĝ, in compiled code, on CPUs.
 
-`gsgan.model.body_points.BodyPoints` calls `skinned`, `gsgan.model.deformation.Deformation` calls
-`geometry`; both define the same by tensor operations.
+`gsgan.model.body_points.BodyPoints` calls `skin_points`, `gsgan.model.deformation.Deformation`
+calls `geometry`; both define the same by tensor operations.
 """
 
 import ctypes
@@ -46,7 +46,7 @@ _SkinJob = build.job_type(
 
 
 def has_skinned(bones: Tensor, weight: Tensor) -> bool:
-    """Whether `skinned` can be used: on a CPU, where no transform of a bone needs a gradient."""
+    """Whether `skin_points` can be used: on a CPU, where no bone's transform needs a gradient."""
     return (
         bones.device.type == "cpu"
         and bones.dtype in build.DTYPES
@@ -56,7 +56,7 @@ def has_skinned(bones: Tensor, weight: Tensor) -> bool:
     )
 
 
-def skinned(
+def skin_points(
     bones: Tensor,
     rest: Tensor,
     normals: Tensor,
@@ -73,7 +73,7 @@ def skinned(
         weights: ``[N, n]`` bones of each point and their weights, which are divided by their sum.
         slopes: of `gsgan.body.skinned.WeightGradients`; None: shapes follow the frames alone.
         floor: share of the area at rest at which a normal fades.
-        limit: of `gsgan.body.lbs.stretched`.
+        limit: of `gsgan.body.lbs.stretch_jacobian`.
 
     Returns:
         Means ``[B, N, 3]``, frames and origins (A and t of LBS), the Jacobians ``[B, N, 3, 3]``

@@ -15,19 +15,12 @@ from gsgan.model.light import LIGHT_RATE, SharedLight
 from gsgan.model.residual_gaussians import ResidualGaussians, Residuals
 from gsgan.skeleton import Points
 from gsgan.skeleton.densify import rows_of
-from gsgan.splat.sh import brightened
+from gsgan.splat.sh import brighten
 from gsgan.utils.checks import between, whole
-from gsgan.utils.tensors import derived, farthest_points
+from gsgan.utils.tensors import derive, farthest_points
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
 POSE_AXES = 20  # principal directions of the training poses' codes
-POSE_BUFFERS = (
-    "pose_mean",
-    "pose_axes",
-    "pose_spread",
-    "place_mean",
-    "place_spread",
-)
 
 
 class Deformation(ResidualGaussians):
@@ -97,14 +90,13 @@ class Deformation(ResidualGaussians):
         self.position_octaves = position_octaves
         self.pose_limit = pose_limit
         size = 3 * joints
-        shapes = (
-            (size,),
-            (size, POSE_AXES),
-            (POSE_AXES,),
-            (points, 3),
-            (points, 3),
-        )
-        for name, shape in zip(POSE_BUFFERS, shapes, strict=True):
+        for name, shape in (
+            ("pose_mean", (size,)),
+            ("pose_axes", (size, POSE_AXES)),
+            ("pose_spread", (POSE_AXES,)),
+            ("place_mean", (points, 3)),
+            ("place_spread", (points, 3)),
+        ):
             value = math.inf if name.endswith("spread") else 0.0
             self.register_buffer(name, torch.full(shape, value))
 
@@ -113,12 +105,12 @@ class Deformation(ResidualGaussians):
             "rest_code", positional_encoding(rest_points.float(), rest_octaves)
         )
         self.embedding = nn.Parameter(0.1 * torch.randn(points, embedding))
-        point_size = encoded_size(3, rest_octaves) + embedding
+        point_size = encoding_size(3, rest_octaves) + embedding
 
         # The first layer has a part for each input, so that those of points are computed once.
         self.from_point = nn.Linear(point_size, width)
         self.from_position = nn.Linear(
-            encoded_size(3, position_octaves), width, bias=False
+            encoding_size(3, position_octaves), width, bias=False
         )
         self.from_pose = nn.Linear(3 * joints, width, bias=False)
         self.from_normal = nn.Linear(3, width, bias=False) if normals else None
@@ -210,13 +202,6 @@ class Deformation(ResidualGaussians):
             far.isfinite().all(), self.pose_mean + along @ axes.mT, code
         )
 
-    def _load_from_state_dict(
-        self, state: dict[str, Tensor], prefix: str, *rest: Any
-    ) -> None:
-        for name in POSE_BUFFERS:  # runs of before 2026-11-25 have none
-            state.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state, prefix, *rest)
-
     def residuals(
         self,
         points: Points,
@@ -239,7 +224,7 @@ class Deformation(ResidualGaussians):
             raw += (
                 table if chosen is None else functional.embedding(chosen, table)
             )
-        residuals = self._parted(raw)
+        residuals = self._split(raw)
 
         # Colours are lit by where the points face in this pose, and by what shades them, which is
         # found where the MLP is computed.
@@ -249,17 +234,17 @@ class Deformation(ResidualGaussians):
         normals = points.normals
         if chosen is not None:
             normals = rows_of(normals, chosen)
-        sh = brightened(residuals.sh, self.light(normals, lit))
+        sh = brighten(residuals.sh, self.light(normals, lit))
         return replace(residuals, sh=sh)
 
     def _at_points(self, values: Tensor, chosen: Tensor | None) -> Tensor:
         """Values where the MLP is computed ``[B, A, C]`` at the points ``chosen [B, M]``, or at
         all."""
         if self.anchored:
-            return self._interpolated(values, chosen)
+            return self._interpolate(values, chosen)
         return values if chosen is None else rows_of(values, chosen)
 
-    def _interpolated(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
+    def _interpolate(self, raw: Tensor, chosen: Tensor | None) -> Tensor:
         """The anchors' ``raw [B, A, C]`` at the points ``chosen [B, M]``, or at all."""
         items = []
         for i, values in enumerate(raw):
@@ -299,7 +284,7 @@ class Deformation(ResidualGaussians):
         if torch.is_grad_enabled() and not (
             code.requires_grad or normals.requires_grad
         ):
-            x = self._trained(code, normals, pose)
+            x = self._run_trunk(code, normals, pose)
         else:
             # The inputs that depend on both pose and point enter by one product.
             weight = self.from_position.weight
@@ -328,10 +313,10 @@ class Deformation(ResidualGaussians):
 
         def make() -> Tensor:
             # The place at rest and the learned numbers of the point.
-            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
-            return found
+            features: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            return features
 
-        return derived(
+        return derive(
             self,
             "point part",
             make,
@@ -341,7 +326,7 @@ class Deformation(ResidualGaussians):
             self.rest_code,
         )
 
-    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
+    def _run_trunk(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
         """The trunk's output; its layers are one operation, which computes no unused gradient."""
         # Inputs that need no gradient come first, those that learn last.
         given = [self.rest_code, code]
@@ -392,7 +377,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
 
 
-def encoded_size(dimensions: int, octaves: int) -> int:
+def encoding_size(dimensions: int, octaves: int) -> int:
     """Size of the `positional_encoding` of ``dimensions`` coordinates."""
     return dimensions * (1 + 2 * octaves)
 
@@ -443,12 +428,12 @@ class _Trunk(torch.autograd.Function):
 
         # The gradient at the last layer's output, before its ReLU.
         g = through(grad.reshape(B * N, -1), outputs[-1], 0)
-        found: list[Tensor | None] = []
+        gradients: list[Tensor | None] = []
 
         # From the last layer to the second: gradients of weight and bias, then of the layer's
         # input.
         for w, x in zip(reversed(weights), reversed(outputs[:-1]), strict=True):
-            found = [g.mT @ x, g.sum(0), *found]
+            gradients = [g.mT @ x, g.sum(0), *gradients]
             g = g @ w
             through.grad_input(g, x, 0, grad_input=g)
 
@@ -459,5 +444,5 @@ class _Trunk(torch.autograd.Function):
             d_learned.view(B, N, learned),
             g.mT @ inputs,
             g.view(B, N, -1).sum(1),
-            *found,
+            *gradients,
         )

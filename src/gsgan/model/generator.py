@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.utils.checks import one_of
-from gsgan.utils.tensors import derived, full_precision
+from gsgan.utils.tensors import derive, full_precision
 
 # inside the root: an all-zero pixel (empty background) stays zero
 NORM_FLOOR = 1e-6
@@ -145,10 +145,10 @@ class DecoderLevel(nn.Module):
         """
         # The kernel has a part for the upsampled map, and one for the skip.
         C = h.shape[1]
-        kernel = derived(
-            self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight
+        kernel = derive(
+            self, "upper", lambda: upsampling_kernel(weight[:, :C]), weight
         )
-        lower = derived(
+        lower = derive(
             self, "lower", lambda: channels_last(weight[:, C:]), weight
         )
 
@@ -304,7 +304,7 @@ class Generator(nn.Module):
             )
 
         # E_c and E_s give features at every level.
-        features = self._padded(F)
+        features = self._pad(F)
         others = [x for x in (S, p2d) if x is not None]
         skips = self.content.levels(self._stem(features, others, fine))
         styles = self.style(features)
@@ -351,31 +351,31 @@ class Generator(nn.Module):
 
         # The part for F; with fine pixels it has a stride and padding in these.
         if fine is None:
-            kernel = derived(
+            kernel = derive(
                 self, "F", lambda: channels_last(weight[:, :C]), weight
             )
             h = functional.conv2d(features, kernel, bias, stride, padding)
         else:
-            kernel = derived(
+            kernel = derive(
                 self, "fine", lambda: fine_kernel(weight, C, k), weight
             )
-            fine = self._padded(fine, k)
+            fine = self._pad(fine, k)
             h = functional.conv2d(fine, kernel, bias, k * stride, k * padding)
 
         # The parts for S and p₂D.
         first = C
         for i, given in enumerate(others):
             part = weight[:, first : first + given.shape[1]]
-            kernel = derived(
+            kernel = derive(
                 self, f"part {i}", partial(channels_last, part), weight
             )
             h += functional.conv2d(
-                self._padded(given), kernel, None, stride, padding
+                self._pad(given), kernel, None, stride, padding
             )
             first += given.shape[1]
         return h
 
-    def _padded(self, x: Tensor, times: int = 1) -> Tensor:
+    def _pad(self, x: Tensor, times: int = 1) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""
         (height, width), stride = x.shape[-2:], times * self.stride
         if height % stride or width % stride:
@@ -398,7 +398,7 @@ def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
     return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))
 
 
-def upsampled_kernel(weight: Tensor) -> Tensor:
+def upsampling_kernel(weight: Tensor) -> Tensor:
     """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
     ``[O, I, 3, 3]`` after upsampling to the nearest."""
     for dim in (2, 3):

@@ -17,7 +17,7 @@ from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.tensors import derived
+from gsgan.utils.tensors import derive
 
 HARMONICS = 9  # of degrees 0, 1 and 2
 RIDGE = 0.02
@@ -108,7 +108,7 @@ class Harmonic(ResidualGaussians):
         """``[N, 9, C]``: C is mean 3, quaternion 4, scale 3, opacity 1, colour 3 (d+1)² and
         features; `_geometry` and `colour_from` make Gaussians of the sums. Means count in
         `mean_step`."""
-        found = []
+        columns = []
 
         # A residual that does not follow the normals has slopes of zero.
         for name, constant in self.constants.items():
@@ -116,8 +116,8 @@ class Harmonic(ResidualGaussians):
                 len(constant), HARMONICS - 1, constant.shape[-1]
             )
             slopes = self.slopes.get(name, none)
-            found.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
-        return torch.cat(found, dim=-1)
+            columns.append(torch.cat([constant.unsqueeze(1), slopes], dim=1))
+        return torch.cat(columns, dim=-1)
 
     def residuals(
         self,
@@ -132,7 +132,7 @@ class Harmonic(ResidualGaussians):
         given = list(self.slopes.values())
         parts = {}
         if given:
-            slopes = derived(
+            slopes = derive(
                 self, "slopes", lambda: torch.cat(given, dim=-1), *given
             )
             # a product with N small matrices takes longer
@@ -148,25 +148,25 @@ class Harmonic(ResidualGaussians):
             "sh": 3 * (self.active_degree + 1) ** 2,
             "features": self.active_features,
         }
-        found = []
+        terms = []
         for name, constant in self.constants.items():
             used = active.get(name, constant.shape[-1])
             values = constant.expand(len(points.means), -1, -1)[..., :used]
-            found.append(
+            terms.append(
                 values + parts[name][..., :used] if name in parts else values
             )
 
         # All residuals in the order of `Residuals`, of the chosen points.
-        raw = torch.cat(found, dim=-1)
+        raw = torch.cat(terms, dim=-1)
         if chosen is not None:
             raw = raw.gather(
                 1, chosen.unsqueeze(-1).expand(-1, -1, raw.shape[-1])
             )
-        return self._parted(raw)
+        return self._split(raw)
 
 
 @torch.no_grad()
-def distilled(
+def distil(
     avatar: Avatar,
     poses: Iterable[Pose],
     *,
@@ -190,16 +190,16 @@ def distilled(
         ConfigError: when the avatar has no Ψ.
     """
     # The copy keeps every part but Ψ.
-    found = deepcopy(avatar)
-    psi = found.deformation
+    copied = deepcopy(avatar)
+    psi = copied.deformation
     if psi is None:
         raise ConfigError(
             "only avatars with Ψ have residuals to distil (model=full, splat_only)"
         )
-    on_body = None if keep_offsets else found.body_points
+    on_body = None if keep_offsets else copied.body_points
     moves = on_body is not None and on_body.offsets is not None
     if isinstance(psi, Harmonic) and not moves:
-        return found
+        return copied
 
     # All features are fitted, also those that a frozen avatar leaves out.
     psi.active_features = psi.features
@@ -220,7 +220,7 @@ def distilled(
     ).to(avatar.rest_points.device)
 
     # The fit over all poses. `Harmonic` multiplies its means by mean_step, so they are divided.
-    samples = _samples(found, psi, on_body, poses)
+    samples = _samples(copied, psi, on_body, poses)
     maps, mean = ridge_regression(samples, ridge)
     maps[..., :3] /= psi.mean_step
     mean[..., :3] /= psi.mean_step
@@ -233,10 +233,10 @@ def distilled(
         )
         if name in follow:
             fitted.slopes[name].copy_(linear[:, 1:])
-    found.deformation = fitted
+    copied.deformation = fitted
     if on_body is not None:
         on_body.offsets = None
-    return found.freeze()
+    return copied.freeze()
 
 
 def _samples(
@@ -279,7 +279,7 @@ def ridge_regression(
 
     Args:
         samples: pairs ``[N, K]``, ``[N, C]``; the first input is 1.
-        ridge: see `distilled`; the first input has no penalty.
+        ridge: see `distil`; the first input has no penalty.
 
     Returns:
         ``[N, K, C]`` and ``[N, C]``, float64.

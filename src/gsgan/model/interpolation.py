@@ -55,10 +55,10 @@ class Interpolation:
         known = values.dtype in (torch.float32, torch.float64)
         if trained and known and values.device.type == "cpu":
             transpose = self._transpose(near, share, len(values))
-            found: Tensor = _Interpolated.apply(
+            result: Tensor = _Interpolated.apply(
                 values, rows, weights, chosen, transpose
             )
-            return found
+            return result
         return functional.embedding_bag(
             rows, values, per_sample_weights=weights, mode="sum"
         )
@@ -115,5 +115,5 @@ class _Interpolated(torch.autograd.Function):
             shape = (ctx.transpose.shape[1], gradient.shape[1])
             every = gradient.new_zeros(shape)
             gradient = every.index_add_(0, ctx.chosen, gradient)
-        found = torch.from_numpy(ctx.transpose @ gradient.numpy())
-        return found, None, None, None, None
+        gradients = torch.from_numpy(ctx.transpose @ gradient.numpy())
+        return gradients, None, None, None, None

@@ -7,7 +7,7 @@ from torch import Tensor
 from gsgan.scene import Window
 
 
-def painted_window(alpha: Tensor, *, margin: int, multiple: int) -> Window:
+def find_window(alpha: Tensor, *, margin: int, multiple: int) -> Window:
     """The boxes round the pixels of images where something was splatted.
 
     They begin at multiples of ``multiple`` pixels, so that strided convolutions group the same
@@ -18,8 +18,8 @@ def painted_window(alpha: Tensor, *, margin: int, multiple: int) -> Window:
         margin: pixels kept round every pixel above 0.
         multiple: of the corners and sides, pixels, where the image has room.
     """
-    rows = _painted_range(alpha.amax(dim=(1, 3)), margin, multiple)
-    columns = _painted_range(alpha.amax(dim=(1, 2)), margin, multiple)
+    rows = _find_ranges(alpha.amax(dim=(1, 3)), margin, multiple)
+    columns = _find_ranges(alpha.amax(dim=(1, 2)), margin, multiple)
     return Window(
         corners=tuple(zip(rows.starts, columns.starts, strict=True)),
         size=(rows.side, columns.side),
@@ -34,7 +34,7 @@ class _Ranges(NamedTuple):
     side: int
 
 
-def _painted_range(alpha: Tensor, margin: int, multiple: int) -> _Ranges:
+def _find_ranges(alpha: Tensor, margin: int, multiple: int) -> _Ranges:
     """The boxes round the values above 0 in each row of ``[B, L]``."""
     starts = []
     side = multiple

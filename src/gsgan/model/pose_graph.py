@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model.deformation import encoded_size, positional_encoding
+from gsgan.model.deformation import encoding_size, positional_encoding
 from gsgan.scene import Camera
 from gsgan.skeleton import (
     MEDIAPIPE33,
@@ -95,7 +95,7 @@ class PoseGraph(nn.Module):
         self.octaves = octaves
         self.layers = nn.ModuleList(
             [
-                GraphLayer(mask, encoded_size(6, octaves), width),
+                GraphLayer(mask, encoding_size(6, octaves), width),
                 GraphLayer(mask, width, width),
                 GraphLayer(alone, width, width),
                 GraphLayer(alone, width, joint_channels),

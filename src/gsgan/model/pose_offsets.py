@@ -1,7 +1,6 @@
 """Offsets of a body's points that depend on how the bones about them turn."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -41,7 +40,6 @@ class PoseOffsets(nn.Module):
         self.field = nn.Parameter(torch.zeros(count, 9 * followed, 3))
         # Constant offsets are not trained: the residuals of Ψ can learn the same.
         self.register_buffer("rest", torch.zeros(count, 3))
-        self.register_load_state_dict_pre_hook(_without_rest)
 
     @torch.no_grad()
     def start(self, rest: Tensor, field: Tensor) -> None:
@@ -79,13 +77,5 @@ class PoseOffsets(nn.Module):
 
         # The offsets of all poses at once: the table has a row for each control.
         table = offsets.transpose(0, 1).flatten(1)
-        found = interpolate(table)
-        return found.unflatten(1, (-1, 3)).transpose(0, 1)
-
-
-def _without_rest(
-    offsets: nn.Module, state: dict[str, Tensor], prefix: str, *_: Any
-) -> None:
-    """Offsets of checkpoints before 2026-11-27 are zero in the rest pose."""
-    assert isinstance(offsets, PoseOffsets)
-    state.setdefault(f"{prefix}rest", torch.zeros_like(offsets.rest))
+        offsets_of_points = interpolate(table)
+        return offsets_of_points.unflatten(1, (-1, 3)).transpose(0, 1)

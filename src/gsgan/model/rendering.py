@@ -46,7 +46,7 @@ class Rendering:
         """Image and alpha without the maps that led to them."""
         return Rendering(self.image, self.alpha)
 
-    def pasted(self, window: Window) -> Rendering:
+    def paste(self, window: Window) -> Rendering:
         """The rendering in the whole image, with background outside the window."""
         # Only the maps that exist are pasted, into images of zeros.
         names = (

@@ -124,7 +124,7 @@ class ResidualGaussians(nn.Module):
         active = values[..., : first + 3 * (self.active_degree + 1) ** 2]
         return torch.cat([active, values[..., last:]], dim=-1)
 
-    def _parted(self, raw: Tensor) -> Residuals:
+    def _split(self, raw: Tensor) -> Residuals:
         """The residuals of raw numbers ``[B, N, ...]``, those of `_active`."""
         sizes = (
             *self.parts[:4],
@@ -207,7 +207,7 @@ class ResidualGaussians(nn.Module):
         means = points.means + matvec(frames, offset * height)
 
         # Shapes: the point's own frame, turned by the quaternion and scaled.
-        scales = bounded(
+        scales = clamp_soft(
             points.scales.log().unsqueeze(-1) + residuals.scales, low, high
         ).exp()
         axes = points.shapes @ quaternion_to_rotation_matrix(
@@ -216,7 +216,7 @@ class ResidualGaussians(nn.Module):
         axes = axes * scales.unsqueeze(-2)
 
         # Opacities start at `opacity`; points that are not valid are transparent.
-        logits = bounded(
+        logits = clamp_soft(
             logit + residuals.opacities, -self.logit_bound, self.logit_bound
         )
         opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
@@ -324,7 +324,7 @@ class _Bounded(torch.autograd.Function):
         return grad.masked_fill(outwards, 0.0), None, None
 
 
-def bounded(x: Tensor, low: float, high: float) -> Tensor:
+def clamp_soft(x: Tensor, low: float, high: float) -> Tensor:
     """``x`` clamped to [low, high], with a gradient that leads back.
 
     Beyond a bound the gradient is 0 where a step against it would lead further out, and

@@ -150,7 +150,7 @@ class Segmentation(SkinnedGaussians):
         A, t = self.points.blend(pose)
         means = skin(self.points.means, A, t)
         features = self.one_hot.expand(len(A), -1, -1)
-        return self.deformed(
+        return self.deform(
             A, means, self.log_scales, self.logit_opacities, features
         )
 

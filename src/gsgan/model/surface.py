@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from gsgan.body import SkinnedBody, skin
 from gsgan.model.body_points import SkinnedGaussians
-from gsgan.model.residual_gaussians import bounded, colour_from
+from gsgan.model.residual_gaussians import clamp_soft, colour_from
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.utils.checks import one_of
 
@@ -95,10 +95,12 @@ class SurfaceGaussians(SkinnedGaussians):
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(
             len(A), -1, -1, -1
         )
-        return self.deformed(
+        return self.deform(
             A,
             means,
-            bounded(self.log_scales, low, high),
-            bounded(self.logit_opacities, -self.logit_bound, self.logit_bound),
+            clamp_soft(self.log_scales, low, high),
+            clamp_soft(
+                self.logit_opacities, -self.logit_bound, self.logit_bound
+            ),
             colour_from(eye, means, A, sh),
         )

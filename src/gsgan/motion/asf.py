@@ -31,10 +31,10 @@ def asf_of(amc: Path) -> Path:
         DataError: when there is none, or more than one candidate.
     """
     subject, _, _ = amc.stem.partition("_")
-    found = sorted(amc.parent.glob("*.asf"))
+    paths = sorted(amc.parent.glob("*.asf"))
     named = [
-        path for path in found if path.stem in (amc.stem, subject)
-    ] or found
+        path for path in paths if path.stem in (amc.stem, subject)
+    ] or paths
     if len(named) != 1:
         raise DataError(
             f"{amc} needs its skeleton, an .asf file: found {len(named)} beside it; give "
@@ -150,7 +150,7 @@ def _read_skeleton(path: Path) -> _Skeleton:
 
     # The bones.
     bones = {ROOT: _Bone(root, radians)}
-    for words in _described_bones(sections["bonedata"]):
+    for words in _parse_bones(sections["bonedata"]):
         name = words["name"][0]
         bones[name] = _Bone(words, radians)
 
@@ -185,7 +185,7 @@ def _refuse_cut(name: str, lines: list[list[str]]) -> None:
         raise ValueError(f"its section :{name} is cut off: a begin has no end")
 
 
-def _described_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:
+def _parse_bones(lines: list[list[str]]) -> list[dict[str, list[str]]]:
     """The values of each bone by key; the first ones of each key count."""
     described = []
     bone: dict[str, list[str]] = {}

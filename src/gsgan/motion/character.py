@@ -51,7 +51,7 @@ class Character:
     anchor_joint: Ints
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
 
-    def skinned(
+    def skin(
         self, rotations: Array, joints: Array, offsets: Array | None = None
     ) -> tuple[Array, Array]:
         """Vertices and normals ``[V, 3]`` of one pose, by linear blend skinning.
@@ -82,11 +82,11 @@ class Character:
 
     def with_descendants(self, bone: int) -> list[int]:
         """A bone and all bones below it."""
-        found = [bone]
+        bones = [bone]
         for j in range(bone + 1, len(self.bones)):
-            if self.parents[j] in found:
-                found.append(j)
-        return found
+            if self.parents[j] in bones:
+                bones.append(j)
+        return bones
 
     def landmarks(self, vertices: Array, joints: Array) -> Array:
         """Landmarks ``[L, 3]`` of a posed mesh, in the order of ``anchor_names``."""

@@ -63,7 +63,7 @@ class Clip:
     part: str = ""  # which part of the file it is, in words, if it has several
     # [F] poses of the subject's body that the landmarks come from, or None
     body: BodyPose | None = None
-    # number of frames without shoulders and hips, see `checked`
+    # number of frames without shoulders and hips, see `mask_unseen`
     filled: int = 0
     # whether hands and face are not where they are on the body, so that the motion must be
     # retargeted
@@ -73,7 +73,7 @@ class Clip:
         return len(self.p)
 
 
-def checked(motion: Clip, min_visibility: float) -> Clip:
+def mask_unseen(motion: Clip, min_visibility: float) -> Clip:
     """The motion with unseen landmarks set to NaN.
 
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
@@ -109,7 +109,7 @@ def checked(motion: Clip, min_visibility: float) -> Clip:
     # Landmarks are mixed; one that only one side has is taken from the nearer
     # frame.
     p = np.where(known[..., None], motion.p, np.nan)
-    filled = mixed(p[before], p[after], share)
+    filled = mix(p[before], p[after], share)
     filled = np.where(np.isfinite(filled), filled, p[nearest])
 
     # Hands and face stay.
@@ -147,7 +147,7 @@ def neighbours(known: Bool) -> Neighbours:
     return Neighbours(before=before, after=after, share=share.clip(0, 1))
 
 
-def mixed(a: Float, b: Float, share: Float) -> Float:
+def mix(a: Float, b: Float, share: Float) -> Float:
     """Landmarks ``[F, J, 3]`` between two; if a share ``[F]`` is 0 or 1, exactly one of them."""
     share = share[:, None, None]
     between = (1 - share) * a + share * b
@@ -177,7 +177,7 @@ def up_axis(motion: Clip) -> str:
     return axis_name(np.median(spine, axis=0))
 
 
-def completed(motion: Clip, up: str) -> Float:
+def complete(motion: Clip, up: str) -> Float:
     """All landmarks ``[F, J, 3]`` in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
@@ -211,11 +211,11 @@ def completed(motion: Clip, up: str) -> Float:
     # Hands and the face.
     parts = [body.numpy()]
     for part in (*HAND_JOINTS.values(), FACE):
-        parts.append(_bridged(whole[:, part]))
+        parts.append(_bridge(whole[:, part]))
     return np.concatenate(parts, axis=1)
 
 
-def _bridged(part: Float) -> Float:
+def _bridge(part: Float) -> Float:
     """A hand or face ``[F, n, 3]``; gaps of up to `MAX_GAP` frames are interpolated."""
     known: Bool = np.asarray(np.isfinite(part).all((1, 2)))
     if not known.any():
@@ -223,17 +223,17 @@ def _bridged(part: Float) -> Float:
     before, after, share = neighbours(known)
     is_short = (after - before - 1 <= MAX_GAP) & (after > before)
     bridged = ~known & is_short
-    filled = mixed(part[before], part[after], share)
+    filled = mix(part[before], part[after], share)
     return np.where(bridged[:, None, None], filled, part)
 
 
-def resampled(p: Float, fps: float, wanted: float) -> Float:
+def resample(p: Float, fps: float, wanted: float) -> Float:
     """Landmarks ``[F, J, 3]`` at another frame rate, interpolated linearly."""
     if len(p) == 1 or fps == wanted:
         return p
     times = frame_times(len(p), fps, wanted)
     at = np.minimum(times.astype(int), len(p) - 2)
-    return mixed(p[at], p[at + 1], times - at)
+    return mix(p[at], p[at + 1], times - at)
 
 
 def frame_times(frames: int, fps: float, wanted: float) -> Float:

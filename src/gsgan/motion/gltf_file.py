@@ -177,7 +177,7 @@ class GltfFile:
             )
             return np.full((1, 1, 4), 255, np.uint8)
         if content.startswith(KTX2):
-            image = Image.fromarray(self._transcoded(content))
+            image = Image.fromarray(self._transcode(content))
         else:
             image = Image.open(io.BytesIO(content)).convert("RGBA")
         image.thumbnail((MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
@@ -204,7 +204,7 @@ class GltfFile:
         data, _ = self._view(image.bufferView)
         return bytes(data)
 
-    def _transcoded(self, content: bytes) -> Bytes:
+    def _transcode(self, content: bytes) -> Bytes:
         """The pixels ``[h, w, 4]`` of a KTX2 texture of Basis Universal."""
         try:
             import opengl_basisu
@@ -237,7 +237,7 @@ class GltfFile:
             buffer = self._buffer(entry["buffer"])
             data: Any = buffer[start : start + entry["byteLength"]]
             if packed:
-                data = self._decompressed(data, packed)
+                data = self._decompress(data, packed)
             self._views[index] = (data, entry.get("byteStride") or 0)
         return self._views[index]
 
@@ -268,7 +268,7 @@ class GltfFile:
             )
         return file.read_bytes()
 
-    def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
+    def _decompress(self, data: bytes, packed: dict[str, Any]) -> Bytes:
         """The bytes of a view of EXT_meshopt_compression."""
         try:
             from meshoptimizer import decoder
@@ -309,14 +309,14 @@ def local_matrix(node: Any) -> Array:
     """``[4, 4]`` from a node's axes to those of its parent."""
     if node.matrix:  # stored column by column
         return np.reshape(np.array(node.matrix, np.float64), (4, 4)).T
-    return posed_matrix(
+    return pose_matrix(
         np.array(node.translation or [0, 0, 0], np.float64),
         np.array(node.rotation or [0, 0, 0, 1], np.float64),
         np.array(node.scale or [1, 1, 1], np.float64),
     )
 
 
-def posed_matrix(translation: Array, quaternion: Array, scale: Array) -> Array:
+def pose_matrix(translation: Array, quaternion: Array, scale: Array) -> Array:
     """``[..., 4, 4]`` that scales, then turns, then moves.
 
     Args:

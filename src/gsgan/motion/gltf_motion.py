@@ -12,7 +12,7 @@ from gsgan.motion.gltf_file import (
     FILE_ERRORS,
     GltfFile,
     local_matrix,
-    posed_matrix,
+    pose_matrix,
 )
 from gsgan.motion.humanoid import humanoid_bones
 from gsgan.motion.rotations import Array
@@ -62,7 +62,7 @@ def read_gltf_motion(
         # Any error of a parser means that the file is damaged.
         glb = GltfFile(path)
         nodes = _joints(glb)
-        number = _chosen(glb, animation)
+        number = _choose(glb, animation)
         channels = _channels(glb, number, nodes)
         times = _frame_times(channels)
         if len(times) * len(nodes) > MAX_PLACES:
@@ -113,7 +113,7 @@ def _joints(glb: GltfFile) -> list[int]:
     return glb.parents_first(joints | above)
 
 
-def _chosen(glb: GltfFile, animation: str | None) -> int:
+def _choose(glb: GltfFile, animation: str | None) -> int:
     """The number of the animation that is asked for."""
     animations = glb.doc.animations
     if not animations:
@@ -150,7 +150,7 @@ def _channels(
     Others, such as the weights of shapes, are left out.
     """
     animation = glb.doc.animations[number]
-    found = {}
+    channels = {}
     for channel in animation.channels:
         node = channel.target.node
         path = channel.target.path
@@ -177,13 +177,13 @@ def _channels(
             raise ValueError("a key is not a number")
         if (np.diff(times) <= 0).any():
             raise ValueError("the times of its keys do not increase")
-        found[node, path] = _Channel(times, values, interpolation)
-    if not found:
+        channels[node, path] = _Channel(times, values, interpolation)
+    if not channels:
         raise DataError(
             f"{glb.path}: animation {animation.name or number} moves no joint of a skeleton; "
             "export it with its armature"
         )
-    return found
+    return channels
 
 
 def _frame_times(channels: Mapping[tuple[int, str], _Channel]) -> Array:
@@ -201,7 +201,7 @@ def _frame_times(channels: Mapping[tuple[int, str], _Channel]) -> Array:
     return np.asarray(start + np.arange(count) / rate)
 
 
-def _sampled(channel: _Channel, times: Array, rotation: bool) -> Array:
+def _sample(channel: _Channel, times: Array, rotation: bool) -> Array:
     """Values ``[F, n]`` at times ``[F]``; before the first and after the last key they stay."""
     # A frame just before a key, by rounding, has the key's value.
     keys = channel.times
@@ -246,7 +246,7 @@ def _rig_motion(
     for node in nodes:
         rest = local_matrix(glb.doc.nodes[node])
         locals_at_rest[node] = rest
-        locals_posed[node] = _posed(
+        locals_posed[node] = _pose_node(
             glb.doc.nodes[node], node, rest, channels, times
         )
     rest = _worlds(glb, nodes, locals_at_rest)
@@ -282,7 +282,7 @@ def _rig_motion(
     )
 
 
-def _posed(
+def _pose_node(
     entry: Any,
     node: int,
     rest: Array,
@@ -303,16 +303,14 @@ def _posed(
     for path, own in values.items():
         if (node, path) in channels:
             channel = channels[node, path]
-            sampled[path] = _sampled(
-                channel, times, rotation=path == "rotation"
-            )
+            sampled[path] = _sample(channel, times, rotation=path == "rotation")
         else:
             # A property without keys is the same in all frames.
             constant = np.array(own, np.float64)
             sampled[path] = np.broadcast_to(
                 constant, (len(times), len(constant))
             )
-    return posed_matrix(
+    return pose_matrix(
         sampled["translation"], sampled["rotation"], sampled["scale"]
     )
 

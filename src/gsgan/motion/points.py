@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.motion.clip import rate_of
-from gsgan.skeleton.joints import BODY, known, zeros_as_missing
+from gsgan.skeleton.joints import BODY, is_known, zeros_as_missing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 from gsgan.utils.files import read_text
@@ -68,39 +68,39 @@ def read_points3d(path: Path) -> Points3D:
         DataError: when it is damaged, or without shoulders and hips.
         ConfigError: for a .c3d file without the extra ``c3d``.
     """
-    found = (
+    points = (
         _read_c3d(path) if path.suffix.lower() == ".c3d" else _read_trc(path)
     )
-    if found.unit is not None and found.unit not in UNITS:
+    if points.unit is not None and points.unit not in UNITS:
         raise DataError(
-            f"{path}: Units is {found.unit!r}; expected one of {', '.join(UNITS)}"
+            f"{path}: Units is {points.unit!r}; expected one of {', '.join(UNITS)}"
         )
 
     # The joints that MediaPipe has too.
-    p = np.full((len(found.places), BODY, 3), np.nan)
-    for marker, name in enumerate(found.names):
+    p = np.full((len(points.places), BODY, 3), np.nan)
+    for marker, name in enumerate(points.names):
         joint = _joint(name)
         if joint is not None:
-            p[:, joint] = found.places[:, marker]
+            p[:, joint] = points.places[:, marker]
 
     # Some programs write zeros for markers that were not seen.
     p = zeros_as_missing(p)
     if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
         raise DataError(
             f"{path} has no shoulders and hips; expected joints such as LShoulder and LHip, found "
-            f"{', '.join(found.names)}"
+            f"{', '.join(points.names)}"
         )
-    p *= _metres(p) if found.unit is None else UNITS[found.unit]
-    order = np.argsort(found.frames)
+    p *= _metres(p) if points.unit is None else UNITS[points.unit]
+    order = np.argsort(points.frames)
     p = p[order]
 
     # A joint without all coordinates is missing.
-    seen = known(p)
+    seen = is_known(p)
     return Points3D(
-        frames=found.frames[order],
+        frames=points.frames[order],
         p=np.where(seen[..., None], p, np.nan),
         conf=seen.astype(np.float64),
-        fps=found.fps,
+        fps=points.fps,
     )
 
 

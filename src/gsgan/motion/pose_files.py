@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from gsgan.motion.clip import Clip, rate_of
-from gsgan.motion.retarget import steadied
+from gsgan.motion.retarget import steady
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import rest_face
 from gsgan.skeleton.hands import FINGERS, HAND_NAMES, WRIST
@@ -108,7 +108,7 @@ def read_pose(path: Path, subject: Proportions) -> Clip:
     if face.confidence.any():
         (mesh,) = _parts_to_metres([face], [AVERAGE_FACE], FACE_LENGTHS)
         chosen = list(FACE_MESH.values())
-        points.append(steadied(mesh)[:, chosen])
+        points.append(steady(mesh)[:, chosen])
         confidences.append(face.confidence[:, chosen])
 
     unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"

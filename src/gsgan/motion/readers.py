@@ -856,12 +856,12 @@ def _read_rig(path: Path, source: Source) -> Clip:
 
 def read_markers(path: Path, source: Source) -> Clip:
     """Joints of markerless motion capture (.trc, .c3d); markers on the skin are not supported."""
-    found = read_points3d(path)
+    markers = read_points3d(path)
     return Clip(
         path=path,
-        p=found.p,
-        visibility=found.conf,
-        fps=found.fps,
+        p=markers.p,
+        visibility=markers.conf,
+        fps=markers.fps,
         up=None,
         unit="metres",
     )

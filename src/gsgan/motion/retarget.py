@@ -51,7 +51,7 @@ RIG_JOINTS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 LEFT_LANDMARKS = (11, 13, 15, 23, 25, 27)
 
 
-def retargeted(
+def retarget(
     p: Float, subject: Proportions, scale: float | None = None
 ) -> Float:
     """The subject's landmarks ``[F, J, 3]`` in the poses of another person.
@@ -62,7 +62,7 @@ def retargeted(
     With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
     their place in the world does not matter. A hand with NaN stays NaN.
 
-    A face, J = 105, is given as `expressed` returns it, and put on the head. NaN stays NaN.
+    A face, J = 105, is given as `transfer_face` returns it, and put on the head. NaN stays NaN.
 
     Args:
         p: ``[F, J, 3]`` landmarks of the other person; those of the body are finite.
@@ -104,7 +104,7 @@ def retargeted(
         turn = axes @ hand_frame(rest, wrist, first, second).T
         if given.shape[1] > BODY:
             hand = HAND_JOINTS[wrist]
-            from_wrist, palm = _posed_hand(given[:, hand], subject, wrist)
+            from_wrist, palm = _pose_hand(given[:, hand], subject, wrist)
             result[:, hand] = q[:, wrist, None] + from_wrist
             turn = np.where(np.isfinite(palm), palm, turn)
         own = rest[list(ends)] - rest[wrist]
@@ -135,7 +135,7 @@ def retargeted(
     return result
 
 
-def expressed(p: Float, rest: Float) -> Float:
+def transfer_face(p: Float, rest: Float) -> Float:
     """The subject's face ``[F, 30, 3]`` with another person's expressions, in the head's axes.
 
     One similarity aligns all frames with the subject's face. Offsets from the median over the
@@ -154,35 +154,35 @@ def expressed(p: Float, rest: Float) -> Float:
     own = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
     onto = own.repeat(len(given), 1)
-    found = _aligned(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
+    face = _align(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
 
     # Expressions are offsets from the other person's face at rest.
-    at_rest, _ = found.nanmedian(0)
-    return (own + found - at_rest).numpy()
+    at_rest, _ = face.nanmedian(0)
+    return (own + face - at_rest).numpy()
 
 
-def steadied(p: Float) -> Float:
+def steady(p: Float) -> Float:
     """Landmarks of a face ``[F, n, 3]``, metres, NaN where not seen, in axes fixed to the head.
 
     Frames are aligned with their median. Landmarks that move much count little in the frame's
     alignment: a jaw that drops does not nod the head.
     """
     # At first, the frame with most landmarks stands for the median.
-    found = torch.from_numpy(p)
-    seen = found.isfinite().all(-1, keepdim=True).double()
-    usual = found[seen.sum((1, 2)).argmax()]
+    aligned = torch.from_numpy(p)
+    seen = aligned.isfinite().all(-1, keepdim=True).double()
+    usual = aligned[seen.sum((1, 2)).argmax()]
     weight = seen * usual.isfinite()[:, :1]
     for _ in range(ALIGN_ROUNDS):
-        found = _aligned(found, usual.nan_to_num(), weight)
-        usual, _ = found.nanmedian(0)
+        aligned = _align(aligned, usual.nan_to_num(), weight)
+        usual, _ = aligned.nanmedian(0)
 
         # Cauchy's weights.
-        moved = squared_norm(found - usual) / FACE_STILL**2
+        moved = squared_norm(aligned - usual) / FACE_STILL**2
         weight = (1 / (1 + moved)).nan_to_num()
-    return found.numpy()
+    return aligned.numpy()
 
 
-def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
+def _align(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     """Points moved by the similarity of each frame that brings them nearest to others.
 
     With centred points a and b and weights w, the rotation is ``U diag(1, 1, det) Vᵀ`` of the
@@ -210,7 +210,7 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     return centre + scale[:, None, None] * a @ U @ Vh
 
 
-def _posed_hand(
+def _pose_hand(
     p: Float, subject: Proportions, wrist: int
 ) -> tuple[Float, Float]:
     """The subject's hand in the pose of landmarks ``[F, 21, 3]``.
@@ -283,7 +283,7 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
     return p
 
 
-def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
+def join(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
     """Clips ``[F, J, 3]`` of the subject, one after the other, with transitions of n frames.
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
@@ -318,13 +318,13 @@ def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
         # Landmarks that an end lacks are missing in between.
         known = np.isfinite(ends).all((0, 2))[:, None]
         transition = np.where(known, path(np.arange(1, n + 1)), np.nan)
-        parts.append(retargeted(transition, subject, scale=1.0))
+        parts.append(retarget(transition, subject, scale=1.0))
         parts.append(after)
     return np.concatenate(parts)
 
 
 def face_in_head(p: Float) -> Float:
-    """Landmarks ``[F, J, 3]`` with the face in the head's axes, as `retargeted` takes it."""
+    """Landmarks ``[F, J, 3]`` with the face in the head's axes, as `retarget` takes it."""
     body = torch.from_numpy(p[:, :BODY])
     face = torch.from_numpy(p[:, FACE])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
@@ -338,7 +338,7 @@ def heading(p: Float) -> float:
     return float(torch.atan2(front[0], -front[1]))
 
 
-def placed(
+def place(
     p: Float,
     subject: Proportions,
     centre: Float,

@@ -109,11 +109,11 @@ def phalanges(
 ) -> list[tuple[str, str]]:
     """A finger's bones that have a following joint, with the name of that joint."""
     names = [f"{side}Hand{finger}{k}" for k in (1, 2, 3, 4)]
-    found = []
+    pairs = []
     for bone, following in pairwise(names):
         if bone in joint and following in joint:
-            found.append((bone, following))
-    return found
+            pairs.append((bone, following))
+    return pairs
 
 
 class FingerHinge(NamedTuple):

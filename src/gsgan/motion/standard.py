@@ -84,12 +84,12 @@ PHALANX_NUMBERS = {
 SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
 
 
-def known_joints(names: tuple[str, ...]) -> dict[str, int]:
+def find_joints(names: tuple[str, ...]) -> dict[str, int]:
     """Mixamo's bone name → index, for joints named as by Mixamo, MakeHuman, CMU, Blender, ….
 
     Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
-    found: dict[str, int] = {}
+    joints: dict[str, int] = {}
     ranks: dict[str, int] = {}
     for j, name in enumerate(plain_names(names)):
         # MakeHuman's helpers and end sites are no bones.
@@ -97,9 +97,9 @@ def known_joints(names: tuple[str, ...]) -> dict[str, int]:
             continue
         bone, rank = _bone(name)
         if bone and rank < ranks.get(bone, 99):
-            found[bone] = j
+            joints[bone] = j
             ranks[bone] = rank
-    return found
+    return joints
 
 
 def _bone(name: str) -> tuple[str, int]:
@@ -188,7 +188,7 @@ class RigMotion:
                 p[j] += p[parent]
         return p
 
-    def posed(self) -> Array:
+    def pose(self) -> Array:
         """Joints ``[F, J, 3]`` of all frames, units and axes of the file."""
         p = np.zeros((*self.root.shape[:-1], len(self.names), 3))
         p[:, 0] = self.root
@@ -244,7 +244,7 @@ def standard_motion(
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
     known = body_joints(rig, path)
-    posed = rig.posed()
+    posed = rig.pose()
 
     # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
@@ -293,7 +293,7 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     Raises:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = known_joints(rig.names)
+    known = find_joints(rig.names)
     missing = [
         bone for bone in REQUIRED if bone not in known and bone != "Hips"
     ]
@@ -329,12 +329,12 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
 
 def _count(rig: RigMotion, bone: str) -> int:
     """The number of joints that may be a bone, without the further segments below them."""
-    found = set()
+    digits = set()
     for j, name in enumerate(rig.names):
         meant, _ = _bone(name)
         if meant == bone:
-            found.add(j)
-    return sum(found.isdisjoint(_line(rig, j)) for j in found)
+            digits.add(j)
+    return sum(digits.isdisjoint(_line(rig, j)) for j in digits)
 
 
 def _line(rig: RigMotion, j: int) -> list[int]:

@@ -163,7 +163,7 @@ class BodyProblem(ABC):
     def solver(self, shared: Tensor) -> Solver:
         """The solver for the body with this shape."""
         solver = Solver(
-            self.space.shaped(shape_of(self.space, shared[self.direct :]))
+            self.space.body_of(shape_of(self.space, shared[self.direct :]))
         )
         of_limb = [LIMB.search(name) is not None for name in solver.rig.names]
         weight = torch.where(torch.tensor(of_limb), LIMB_PRIOR**0.5, 1.0).to(
@@ -197,7 +197,7 @@ class BodyProblem(ABC):
         # The landmarks.
         solver = self.solver(at.shared)
         X = self.landmarks(at, solver)
-        found = self.terms(X, at.shared[: self.direct], linear=False)
+        terms = self.terms(X, at.shared[: self.direct], linear=False)
 
         # The priors of poses, of the size and of shared numbers, and the joints' limits.
         stop, amount = below_minimum(at.q, solver.minimum)
@@ -205,7 +205,7 @@ class BodyProblem(ABC):
         pull = of_poses + (stop * amount.square()).sum()
         pull = pull + self.size_error(at.shared[self.direct :]).square()
         of_shared = (self.prior * at.shared.square()).sum()
-        return found.cost + (pull + of_shared)
+        return terms.cost + (pull + of_shared)
 
     def step(self, at: State, damping: float) -> State:
         """One damped Gauss-Newton step: see the top of this module."""
@@ -248,7 +248,7 @@ class BodyProblem(ABC):
         solver = self.solver(at.shared)
         origin = at.q.new_zeros(len(at.q), BODY, 3)
         linear = solver.linear(at.q, at.root, origin)
-        found = self.terms(linear.residual, at.shared[: self.direct])
+        terms = self.terms(linear.residual, at.shared[: self.direct])
         J = linear.by_number.flatten(2).mT  # [F, 99, D]
         F, N, _ = J.shape
         G = J.new_zeros(F, N, len(at.shared))
@@ -257,15 +257,15 @@ class BodyProblem(ABC):
 
         # Poses: the landmarks by the chain rule, the prior and the joints' limits.
         stop, amount = below_minimum(at.q, solver.minimum)
-        pose_pose = J.mT @ (found.W @ J) + solver.prior
+        pose_pose = J.mT @ (terms.W @ J) + solver.prior
         pose_pose = pose_pose + torch.diag_embed(stop + FLOOR)
-        g_pose = (J.mT @ found.g[..., None])[..., 0]
+        g_pose = (J.mT @ terms.g[..., None])[..., 0]
         g_pose = g_pose + at.q @ solver.prior + stop * amount
 
         # The coupling with the first and the second later frame: J[f + k]ᵀ near J[f], and its part
         # of W G in both frames.
-        near = found.near.unsqueeze(-1)
-        WG = found.W @ G
+        near = terms.near.unsqueeze(-1)
+        WG = terms.W @ G
         below = []
         for k in (1, 2):
             coupling = near[k - 1, : F - k]
@@ -275,20 +275,20 @@ class BodyProblem(ABC):
 
         # Poses and shared numbers; the direct ones move no landmark, but residuals.
         pose_shared = J.mT @ WG
-        pose_shared[..., : self.direct] += J.mT @ found.cross
+        pose_shared[..., : self.direct] += J.mT @ terms.cross
 
         # Shared numbers: by landmarks and the prior.
         shared_shared = torch.einsum("fni,fnj->ij", G, WG) + self.prior.diag()
         g_shared = (
-            torch.einsum("fni,fn->i", G, found.g) + self.prior * at.shared
+            torch.einsum("fni,fn->i", G, terms.g) + self.prior * at.shared
         )
 
         # By the direct numbers, whose residuals also depend on the shape.
-        by_direct = torch.einsum("fni,fnj->ij", G, found.cross)
+        by_direct = torch.einsum("fni,fnj->ij", G, terms.cross)
         shared_shared[:, : self.direct] += by_direct
         shared_shared[: self.direct] += by_direct.mT
-        shared_shared[: self.direct, : self.direct] += found.W_direct
-        g_shared[: self.direct] += found.g_direct
+        shared_shared[: self.direct, : self.direct] += terms.W_direct
+        g_shared[: self.direct] += terms.g_direct
 
         # By the person's size, one residual of the shape.
         size = torch.func.jacfwd(self.size_error)(at.shared[self.direct :])
@@ -315,7 +315,7 @@ class BodyProblem(ABC):
         """
 
         def rest(x: Tensor) -> Tensor:
-            body = self.space.shaped(shape_of(self.space, x))
+            body = self.space.body_of(shape_of(self.space, x))
             return torch.cat(
                 [body.joints[solver.joint], body.landmarks.nan_to_num()]
             )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import undistort
 from gsgan.scene import NEAR
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Bool, Float, Ints
 
 MIN_VIEWS = 2
@@ -62,7 +62,7 @@ class CameraArray:
         """The mean of both focal lengths ``[C]``, pixels."""
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
-    def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
+    def normalise(self, uv: Float) -> tuple[CameraArray, Float]:
         """The cameras with focal lengths of `UNIT_FOCAL` pixels, and matching pixels.
 
         Args:
@@ -136,7 +136,7 @@ def film_camera(name: str, size: tuple[int, int], focal: float) -> CameraEntry:
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
     """Pixels ``px [..., 2]`` without lens distortion; K stays, skew included. NaN stays NaN."""
-    seen = known(px)
+    seen = is_known(px)
     if not camera.distorted or not seen.any():
         return np.asarray(px, np.float64)
     # Rays at a depth of 1, where the lens has its distortion.
@@ -181,8 +181,8 @@ def refine_cameras(
         focal_prior: standard deviation of the logarithms of its focal lengths; None fixes them.
     """
     # The points that are used.
-    weight = np.where(known(uv), weight, 0.0)
-    use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
+    weight = np.where(is_known(uv), weight, 0.0)
+    use = is_known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p = p[use]
     uv = uv[:, use]
     weight = weight[:, use]
@@ -228,7 +228,7 @@ def refine_cameras(
         return np.concatenate([r.ravel(), priors(cameras)])
 
     # Few of the parameters act on each residual.
-    found = least_squares(
+    solution = least_squares(
         residuals,
         np.zeros(poses + p.size),
         jac_sparsity=_sparsity(camera, point, len(start), len(p), size),
@@ -239,7 +239,7 @@ def refine_cameras(
 
     # A similarity of the whole world does not change the projections, so that the search hardly
     # moves along it. The priors alone determine it.
-    cameras = cameras_at(found.x)
+    cameras = cameras_at(solution.x)
 
     def world_priors(x: Float) -> Float:
         return priors(_similar(cameras, x))

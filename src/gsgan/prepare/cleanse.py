@@ -11,7 +11,7 @@ from gsgan.skeleton.joints import (
     HANDS,
     PALM_JOINTS,
     WRIST_JOINTS,
-    known,
+    is_known,
 )
 from gsgan.utils.arrays import Bool, Float, nanmedian
 
@@ -56,7 +56,7 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     of any size fits. J is 33, or 105 with hands and face; metres.
     """
     p = p.copy()
-    seen = known(p)
+    seen = is_known(p)
     has_hands = p.shape[1] == ALL
 
     # Joints too far from the body, the wrist or the middle of the face.
@@ -81,7 +81,7 @@ def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
             FINGERS_OF_BOTH,
             _misfit(p, FINGERS_OF_BOTH, FINGER_BONE, FINGER_NOISE),
         )
-    wrong &= known(p)
+    wrong &= is_known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
 
@@ -135,7 +135,7 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
         seconds: standard deviation of the Gaussian neighbourhood.
     """
     # Points that are not used are 0 in the sums and NaN in the result.
-    usable = known(p) & (weight > 0)
+    usable = is_known(p) & (weight > 0)
     filled = np.where(usable[..., None], p, 0.0)
     weight = np.where(usable, weight, 0.0)
     result = np.where(usable[..., None], p, np.nan)

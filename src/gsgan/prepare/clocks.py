@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from gsgan.prepare.camera_array import CameraArray
-from gsgan.prepare.sources import MIN_DECODED, Recording, opened
+from gsgan.prepare.sources import MIN_DECODED, Recording, open_video
 from gsgan.prepare.stages import Advance, StageFolder, each_camera
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Float, Ints, evenly_spaced
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz
@@ -119,7 +119,7 @@ def _cut_off(
 def _times(video: Recording, advance: Advance) -> Float:
     """The times ``[n]`` of all images, seconds from the beginning of the recording."""
     times = []
-    reader = opened(video.path, rotate=False)
+    reader = open_video(video.path, rotate=False)
     while reader.grab():
         times.append(reader.get(cv2.CAP_PROP_POS_MSEC) / 1000)
         advance(len(times), max(len(times), video.count or 0))
@@ -173,7 +173,7 @@ def moments(time: Float, rate: float) -> tuple[dict[int, int], float]:
     return common, float(apart[list(common)].max(initial=0.0))
 
 
-def renumbered(
+def renumber(
     values: Mapping[int, Value], source: Recording
 ) -> dict[int, Value]:
     """Values by the source's own numbers, such as masks, by common numbers."""
@@ -215,7 +215,7 @@ def clock_errors(
         return delay, gain
 
     # The rays of all detections, in the world.
-    seen = known(uv) & (weight > 0)
+    seen = is_known(uv) & (weight > 0)
     px = np.where(seen[..., None], uv, np.nan)
     homogeneous = np.concatenate([px, np.ones((*px.shape[:-1], 1))], axis=-1)
     inverse = np.linalg.inv(cameras.K @ cameras.R)
@@ -377,10 +377,10 @@ def unsteady_clocks(cameras: CameraArray, uv: Float, weight: Float) -> Float:
             shifted[c, inside] = np.where(
                 weight[c, at[inside], :, None] > 0, uv[c, at[inside]], np.nan
             )
-        found, gain = clock_errors(
+        lag, gain = clock_errors(
             cameras, shifted, np.ones(shifted.shape[:3]), DRIFT_LAG
         )
-        parts.append(found)
+        parts.append(lag)
         gains.append(gain)
 
     # A change that matters in one of the parts.

@@ -15,10 +15,10 @@ import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.skeletons import usual_step
-from gsgan.prepare.images import scaled
+from gsgan.prepare.images import scale_camera
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
-from gsgan.skeleton.joints import BODY, FACE, HANDS, joint_names, known
+from gsgan.skeleton.joints import BODY, FACE, HANDS, is_known, joint_names
 from gsgan.skeleton.proportions import axis_name
 from gsgan.utils.arrays import Float, Ints
 from gsgan.utils.errors import DataError
@@ -41,7 +41,7 @@ class Outcome:
     def cameras(self) -> list[CameraEntry]:
         """The cameras of the written images."""
         refined = self.solution.cameras.entries(self.inputs.cameras)
-        return [scaled(camera, self.options.scale) for camera in refined]
+        return [scale_camera(camera, self.options.scale) for camera in refined]
 
     @property
     def fps(self) -> float:
@@ -92,7 +92,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         (options.hands, "hands3d.npz", HANDS),
         (options.face, "face3d.npz", FACE),
     ):
-        if wanted and known(p[:, part]).any():
+        if wanted and is_known(p[:, part]).any():
             write_npz(root / name, **landmarks(part))
 
     # The facts that a reader needs, and the key of the settings.
@@ -132,7 +132,7 @@ def standing_direction(p: Float) -> Float | None:
     ears = p[:, [7, 8]].mean(1)
     head = ears - p[:, [11, 12]].mean(1)
     for directions in (body, head):
-        seen = directions[known(directions)]
+        seen = directions[is_known(directions)]
         if len(seen):
             return np.asarray(np.median(seen, axis=0))
     return None

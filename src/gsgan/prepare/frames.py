@@ -8,8 +8,8 @@ import numpy as np
 
 from gsgan.data.skeletons import HUBS
 from gsgan.prepare.images import JPEG_QUALITY
-from gsgan.prepare.sources import Recording, opened, video_recording
-from gsgan.skeleton.joints import known
+from gsgan.prepare.sources import Recording, open_video, video_recording
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_npz, writing
@@ -82,13 +82,13 @@ def _extract(source: Recording, folder: Path, max_side: float) -> None:
     """Writes evenly spaced images, then their numbers and times."""
     # Seconds between two images, and their scale. A recording without a length is read once for it.
     rate = source.fps or 30.0
-    count = source.count or _counted(source)
+    count = source.count or _count_images(source)
     seconds = count / rate
     every = max(min(1 / IMAGE_RATE, seconds / FEW_IMAGES), seconds / MAX_IMAGES)
     shrink = min(1.0, max_side / max(source.size))
 
     # The header's length may be wrong, so the number of images is bounded.
-    video = opened(source.path, True)
+    video = open_video(source.path, True)
     number = -1
     numbers = list[int]()
     times = list[float]()
@@ -124,9 +124,9 @@ def _extract(source: Recording, folder: Path, max_side: float) -> None:
     write_npz(folder / TIMES, number=np.array(numbers), time=np.array(times))
 
 
-def _counted(source: Recording) -> int:
+def _count_images(source: Recording) -> int:
     """The number of images of a video whose header has none."""
-    video = opened(source.path, True)
+    video = open_video(source.path, True)
     count = 0
     while video.grab():
         count += 1
@@ -134,7 +134,7 @@ def _counted(source: Recording) -> int:
     return count
 
 
-def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
+def find_unusable(px: Float, conf: Float, sharp: Float) -> LeftOut:
     """Masks ``[F]`` of the frames that are no use, by reason; a frame has at most one reason.
 
     Args:
@@ -180,7 +180,7 @@ def left_out(px: Float, conf: Float, sharp: Float) -> LeftOut:
 
 def extents(px: Float) -> Float:
     """The diagonal ``[F]`` of the box around the seen landmarks ``[F, 33, 2]``; NaN without any."""
-    seen = known(px)
+    seen = is_known(px)
     lower = np.where(seen[..., None], px, np.inf).min(1)
     upper = np.where(seen[..., None], px, -np.inf).max(1)
     size = np.linalg.norm(upper - lower, axis=-1)
@@ -199,7 +199,7 @@ def look(files: Sequence[Path], px: Float) -> tuple[Float, float]:
         image = read_grey(path)
 
         # The box of the person, in which sharpness is measured.
-        seen = px[f][known(px[f])]
+        seen = px[f][is_known(px[f])]
         box = np.zeros(4, np.int64)
         if len(seen):
             box = np.r_[seen.min(0), seen.max(0)].astype(np.int64)
@@ -246,10 +246,10 @@ def _flow(before: Bytes, after: Bytes, box: Ints) -> Float:
     if points is None or len(points) < MIN_CORNERS:
         return np.zeros(2)
     start = np.asarray(points, np.float32)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, start.copy()
     )
-    steps = (moved - start)[found.ravel() == 1].reshape(-1, 2)
+    steps = (moved - start)[status.ravel() == 1].reshape(-1, 2)
     return np.median(steps, axis=0) if len(steps) else np.zeros(2)
 
 

@@ -22,7 +22,7 @@ from gsgan.prepare.camera_array import (
 )
 from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.triangulate import robust
-from gsgan.skeleton.joints import BODY, FLIP_GROUPS, known
+from gsgan.skeleton.joints import BODY, FLIP_GROUPS, is_known
 from gsgan.utils.arrays import Float, evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -81,7 +81,7 @@ def calibrate_from_person(
     # Frames with the person in two cameras, evenly spaced.
     uv = uv[:, :, :BODY]
     weight = np.where(
-        known(uv) & (conf[:, :, :BODY] > SEEN_CONFIDENCE), 1.0, 0.0
+        is_known(uv) & (conf[:, :, :BODY] > SEEN_CONFIDENCE), 1.0, 0.0
     )
     shared = np.flatnonzero((weight.sum(2) > 0).sum(0) >= 2)
     frames = shared[evenly_spaced(len(shared), USED_FRAMES)]
@@ -99,12 +99,14 @@ def calibrate_from_person(
         ]
         prior = FOCAL_PRIOR if focal is None else GIVEN_PRIOR
         try:
-            found = _solution(guess, uv, weight, time, prior)
+            calibrated = _solution(guess, uv, weight, time, prior)
         except DataError as error:
             failure = error
             continue
-        if best is None or np.nanmean(found.error) < np.nanmean(best.error):
-            best = found
+        if best is None or np.nanmean(calibrated.error) < np.nanmean(
+            best.error
+        ):
+            best = calibrated
     if best is None:
         assert failure is not None
         raise failure
@@ -122,10 +124,10 @@ def _solution(
     # In thousandths of the focal length, so that images of all sizes count alike.
     C = len(guess)
     images = CameraArray.of(guess)
-    array, pixels = images.normalised(uv)
+    array, pixels = images.normalise(uv)
     per_image = images.focal / array.focal
     flat = pixels.reshape(C, -1, 2)
-    rig = _chained(array, flat, weight.reshape(C, -1), guess)
+    rig = _chain(array, flat, weight.reshape(C, -1), guess)
     near = rig
 
     # Landmarks and cameras together. Detectors swap sides, which a first solution shows.
@@ -151,7 +153,7 @@ def _solution(
     # Errors in pixels of the images, and angles between rays.
     flat = sided.reshape(C, -1, 2)
     found = robust(rig, flat, seen.reshape(C, -1))
-    used = known(found.p)
+    used = is_known(found.p)
     if not used.any():
         raise DataError(
             "calibration=person: no landmark is seen alike by two cameras; do frame numbers agree?"
@@ -172,7 +174,7 @@ def _solution(
     )
 
 
-def _chained(
+def _chain(
     array: CameraArray, uv: Float, weight: Float, guess: list[CameraEntry]
 ) -> CameraArray:
     """The first poses: a pair of cameras, then one camera after the other.
@@ -191,9 +193,9 @@ def _chained(
         both = (weight[a] > 0) & (weight[b] > 0)
         if both.sum() < MIN_COMMON:
             continue
-        found = _pair(rays[a, both], rays[b, both])
-        if found is not None and (best is None or found[0] > best[0]):
-            best = (*found, a, b)
+        pose = _pair(rays[a, both], rays[b, both])
+        if pose is not None and (best is None or pose[0] > best[0]):
+            best = (*pose, a, b)
     if best is None:
         raise DataError(
             "calibration=person: no two cameras see the person at the same time often enough "
@@ -212,8 +214,8 @@ def _chained(
         points = robust(rig[placed], uv[placed], weight[placed]).p
         views = {}
         for c in set(range(len(array))) - set(placed):
-            both = known(points) & (weight[c] > 0)
-            view = _seen_from(points[both], rays[c, both])
+            both = is_known(points) & (weight[c] > 0)
+            view = _locate_camera(points[both], rays[c, both])
             if view is not None:
                 views[c] = view
         if not views:
@@ -253,7 +255,9 @@ def _pair(x: Float, y: Float) -> tuple[float, Float, Float] | None:
     return score, np.asarray(R, np.float64), np.ravel(t)
 
 
-def _seen_from(points: Float, rays: Float) -> tuple[int, Float, Float] | None:
+def _locate_camera(
+    points: Float, rays: Float
+) -> tuple[int, Float, Float] | None:
     """How many points agree with a camera's rays at depth 1, and its R and t."""
     if len(points) < MIN_COMMON:
         return None

@@ -23,7 +23,7 @@ JPEG_QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
 
-def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
+def scale_camera(camera: CameraEntry, scale: float) -> CameraEntry:
     """The camera of the written images: no distortion, K at their size."""
     H, W = camera.size
     h = max(1, round(H * scale))
@@ -48,7 +48,7 @@ def find_masks(
     Raises:
         DataError: when a camera has none.
     """
-    found = {}
+    masks = {}
     for name in names:
         place = folder / name
 
@@ -68,8 +68,8 @@ def find_masks(
             raise DataError(
                 f"{place} holds no masks; expected {name}/000000.png and so on"
             )
-        found[name] = {number: folder / path for number, path in files.items()}
-    return found
+        masks[name] = {number: folder / path for number, path in files.items()}
+    return masks
 
 
 def _first_number(stem: str) -> int:
@@ -119,7 +119,7 @@ def write_images(
 
     # Images are straightened at the full size, then scaled.
     window = Crop(0, 0, camera.size)
-    size = scaled(camera, scale).size
+    size = scale_camera(camera, scale).size
     mapping = None
     if camera.distorted:
         mapping = undistort_map(camera, window)

@@ -20,7 +20,7 @@ from gsgan.skeleton.joints import (
     LEFT,
     RIGHT,
     SETS,
-    known,
+    is_known,
 )
 from gsgan.utils.arrays import Float, Ints, expect_array
 from gsgan.utils.errors import DataError
@@ -74,11 +74,11 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     Raises:
         DataError: when a camera has none, listing those found.
     """
-    found = {}
+    paths = {}
     for name in names:
         for entry in (f"{name}.npz", f"{name}_json", name):
             if (folder / entry).exists():
-                found[name] = folder / entry
+                paths[name] = folder / entry
                 break
         else:
             # The message lists the first entries of the folder.
@@ -89,7 +89,7 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
                 f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
                 f"{name}_json/, found {', '.join(there[:20]) or 'nothing'}"
             )
-    return found
+    return paths
 
 
 def read_detections(path: Path) -> Detections:
@@ -99,11 +99,13 @@ def read_detections(path: Path) -> Detections:
         DataError: on a damaged file or an unknown set of joints.
     """
     # Frames are sorted; NaN, infinity or no confidence mean that a landmark is not seen.
-    found = _read_json(path) if path.is_dir() else _read_npz(path)
-    order = np.argsort(found.frame_id)
-    conf = np.where(known(found.px), np.nan_to_num(found.conf), 0.0)
+    detections = _read_json(path) if path.is_dir() else _read_npz(path)
+    order = np.argsort(detections.frame_id)
+    conf = np.where(
+        is_known(detections.px), np.nan_to_num(detections.conf), 0.0
+    )
     conf = np.clip(conf, 0.0, 1.0)[order]
-    px = np.where(conf[..., None] > 0, found.px[order], np.nan)
+    px = np.where(conf[..., None] > 0, detections.px[order], np.nan)
 
     # Some detectors write shares of the image's size.
     seen = px[conf > 0]
@@ -112,10 +114,12 @@ def read_detections(path: Path) -> Detections:
             f"{path}: all landmarks are between {seen.min():.2f} and {seen.max():.2f}; expected "
             "pixels of the image, not shares of its size"
         )
-    people = found.people
+    people = detections.people
     if people is not None:
         people = [people[row] for row in order.tolist()]
-    return Detections(found.frame_id[order], px, conf, found.notes, people)
+    return Detections(
+        detections.frame_id[order], px, conf, detections.notes, people
+    )
 
 
 class Gathered(NamedTuple):
@@ -132,21 +136,21 @@ def gather(
 ) -> Gathered:
     """Detections of all cameras by common frame numbers: a camera's own plus its offset."""
     ids = []
-    for name, found in detections.items():
-        ids.append(found.frame_id + int(offsets.get(name, 0)))
+    for name, detected in detections.items():
+        ids.append(detected.frame_id + int(offsets.get(name, 0)))
     frames = np.unique(np.concatenate(ids))
     frames = frames[frames >= 0]  # file names hold no negative numbers
 
     # Frames that a camera lacks stay NaN.
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
-    for c, (own, found) in enumerate(
+    for c, (own, detected) in enumerate(
         zip(ids, detections.values(), strict=True)
     ):
         valid = own >= 0
         at = np.searchsorted(frames, own[valid])
-        px[c, at] = found.px[valid]
-        conf[c, at] = found.conf[valid]
+        px[c, at] = detected.px[valid]
+        conf[c, at] = detected.conf[valid]
     return Gathered(frames, px, conf)
 
 
@@ -325,7 +329,7 @@ def _joints(
 
     def put(joints: list[int], triples: Float) -> None:
         confidence = triples[:, 2]
-        seen = known(triples) & (confidence > 0)
+        seen = is_known(triples) & (confidence > 0)
         px[joints] = np.where(
             seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan
         )

@@ -170,7 +170,7 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
         known = known & bool(np.median(change) < MAX_CHANGE)
 
     # Whether each pixel is the person: the mask's evidence, and how unlike the room it is.
-    behind = _shadowed(seen, empty, prior)
+    behind = _shade_room(seen, empty, prior)
     unlike = ((seen - behind) ** 2).sum(-1) / (2 * ROOM_NOISE**2) - UNSURE
     unlike = np.where(known, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
     blurred = cv2.GaussianBlur(prior, (0, 0), reach / 2).clip(0.02, 0.98)
@@ -236,7 +236,7 @@ def _disc(radius: int) -> Bytes:
     return np.asarray(shape, np.uint8)
 
 
-def _shadowed(seen: Single, room: Single, prior: Single) -> Single:
+def _shade_room(seen: Single, room: Single, prior: Single) -> Single:
     """The room's colours ``[H, W, 3]``, in more or less shadow where that explains the image.
 
     The person's shadow darkens all channels alike, in the image or in those that show the room.

@@ -53,16 +53,16 @@ def find_people(
     say: Callable[[str], None],
 ) -> People:
     """Landmarks and masks of each source: given ones, or those of the tool."""
-    found = People({}, {})
+    people = People({}, {})
     if options.needs_tool:
-        found = run_tool(options, sources, stages, say)
+        people = run_tool(options, sources, stages, say)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), sources)
-        found = found._replace(masks=masks)
+        people = people._replace(masks=masks)
     if options.landmarks != MEDIAPIPE:
         landmarks = find_landmarks(options.folder("landmarks"), sources)
-        found = found._replace(landmarks=landmarks)
-    return found
+        people = people._replace(landmarks=landmarks)
+    return people
 
 
 def run_tool(

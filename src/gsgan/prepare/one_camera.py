@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.shape import BodyShape, shape_body
 from gsgan.data.calibration import Calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.skeletons import usual_step
@@ -23,7 +23,7 @@ from gsgan.prepare.frames import (
     SAMPLING,
     LeftOut,
     check_enough,
-    left_out,
+    find_unusable,
     look,
     sample,
 )
@@ -126,10 +126,10 @@ def solve_video(
 
     # The detections in them.
     numbers = np.array(list(source.files))
-    found, masks = find_people(
+    landmark_files, masks = find_people(
         options, {source.name: source}, stages, console.print
     )
-    detected, there = _read(found[source.name], numbers, source.size)
+    detected, there = _read(landmark_files[source.name], numbers, source.size)
     there &= np.isin(numbers, list(masks[source.name]))
 
     # Images of one whole, sharp person.
@@ -137,7 +137,7 @@ def solve_video(
         px = detected.px[:, :BODY]
         conf = detected.conf[:, :BODY] * there[:, None]
         sharp, moved = look(list(source.files.values()), px)
-    left = left_out(px, conf, sharp)
+    left = find_unusable(px, conf, sharp)
     check_enough(video, len(numbers), left)
     used = np.flatnonzero(~np.logical_or.reduce(list(left.values())))
 
@@ -182,7 +182,7 @@ def solve_video(
     )
 
     # The numbers and notes of the report.
-    measured = _measured(view, camera, p, time[kept], seen, left)
+    measured = _measure(view, camera, p, time[kept], seen, left)
     measured["background_moved"] = moved
     measured["focal_stated"] = metadata.focal
     measured["hdr"] = metadata.hdr
@@ -219,7 +219,7 @@ def _read(
 ) -> tuple[Detected, Bool]:
     """Detections at these frame numbers ``[F]``, and which of the frames have any."""
     # The arrays of depth, which only MediaPipe's files have; their rows are in the file's order.
-    found = landmarks.read_detections(path)
+    detections = landmarks.read_detections(path)
     depth = {
         "world": (BODY, 3),
         "left_z": (HAND,),
@@ -229,13 +229,15 @@ def _read(
     arrays = {}
     if not path.is_dir():
         arrays = read_arrays(path, ("frame_id", *depth))
-    F = len(found.frame_id)
+    F = len(detections.frame_id)
     sizes = np.array([size[::-1]])
-    px, conf = landmarks.inside(found.px[None], found.conf[None], sizes)
+    px, conf = landmarks.inside(
+        detections.px[None], detections.conf[None], sizes
+    )
 
     # Rows of `found` are by frame number.
-    at = np.searchsorted(found.frame_id, numbers).clip(max=F - 1)
-    there = found.frame_id[at] == numbers
+    at = np.searchsorted(detections.frame_id, numbers).clip(max=F - 1)
+    there = detections.frame_id[at] == numbers
 
     def depths(name: str, default: float) -> Float:
         shape = (F, *depth[name])
@@ -322,7 +324,7 @@ def _solve(
 def natural_height(shape: BodyShape) -> float:
     """The height in metres from the soles to the top of the head."""
     plain = BodyShape(shape.coefficients.float(), shape.stretch.float())
-    z = shaped_body(plain).vertices[:, 2]
+    z = shape_body(plain).vertices[:, 2]
     return float(z.max() - z.min())
 
 
@@ -416,7 +418,7 @@ def _with_hands(
     return joints, removed
 
 
-def _measured(
+def _measure(
     view: View,
     camera: CameraEntry,
     p: Float,

@@ -256,7 +256,7 @@ class Problem(BodyProblem):
 
     def size_error(self, x: Tensor) -> Tensor:
         """The number of standard deviations by which a body of the shape ``x [S]`` is too large."""
-        body = self.space.shaped(shape_of(self.space, x))
+        body = self.space.body_of(shape_of(self.space, x))
         return (_log_size(body.landmarks) - self.size) / HEIGHT_SPREAD
 
     def residuals(

@@ -12,7 +12,7 @@ from gsgan.prepare.camera_array import CameraArray, undistort_points
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.joints import BODY, known
+from gsgan.skeleton.joints import BODY, is_known
 from gsgan.utils.arrays import Float
 from gsgan.utils.errors import DataError
 
@@ -57,26 +57,26 @@ def one_person(
     Raises:
         DataError: when the people of the cameras can hardly ever be joined.
     """
-    several = crowded_frames(detections, offsets)
+    several = find_crowds(detections, offsets)
     if not several:
         return dict(detections), []
 
     # All people of a frame, by camera: rays need pixels without distortion.
     rig = CameraArray.of(cameras)
     rows = {}
-    for name, found in detections.items():
+    for name, detected in detections.items():
         offset = int(offsets.get(name, 0))
-        numbers = (found.frame_id + offset).tolist()
+        numbers = (detected.frame_id + offset).tolist()
         rows[name] = dict(zip(numbers, range(len(numbers)), strict=True))
     frames = sorted(set().union(*rows.values()))
     steps = []
     for frame in frames:
         people = []
-        for camera, (name, found) in zip(
+        for camera, (name, detected) in zip(
             cameras, detections.items(), strict=True
         ):
             row = rows[name].get(frame)
-            people.append(_people(camera, found, row))
+            people.append(_people(camera, detected, row))
         steps.append(_groups(rig, people))
 
     # The way through all frames, and who is taken in each camera.
@@ -90,27 +90,27 @@ def one_person(
             "person in each file of landmarks"
         )
     result = {}
-    for c, (name, found) in enumerate(detections.items()):
+    for c, (name, detected) in enumerate(detections.items()):
         chosen = {}
         for frame, group in zip(frames, way, strict=True):
             if frame in rows[name] and (group is not None or frame in several):
                 person = -1 if group is None else group.chosen[c]
                 chosen[rows[name][frame]] = person
-        result[name] = _only(found, chosen)
+        result[name] = _only(detected, chosen)
     note = f"{text}; the one that all cameras agree on was taken"
     if failed:
         note += f", and nobody in {len(failed)} frames in which they do not"
     return result, [note]
 
 
-def crowded_frames(
+def find_crowds(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
 ) -> set[int]:
     """The common numbers of frames in which any camera shows several people."""
     several: set[int] = set()
-    for name, found in detections.items():
+    for name, detected in detections.items():
         offset = int(offsets.get(name, 0))
-        several.update(number + offset for number in found.crowded)
+        several.update(number + offset for number in detected.crowded)
     return several
 
 
@@ -137,7 +137,7 @@ def _people(
     people = alone if found.people is None else found.people[row]
     result = []
     for px, conf in people:
-        seen = known(px[:BODY]) & (conf[:BODY] > 0)
+        seen = is_known(px[:BODY]) & (conf[:BODY] > 0)
         uv = undistort_points(camera, px[:BODY])
         result.append((uv, np.where(seen, conf[:BODY], 0.0)))
     return result
@@ -182,7 +182,7 @@ def _group(
     both = (weight > 0).sum(0) == len(pair)
     if both.sum() < MIN_JOINTS:
         return None
-    scaled, pixels = rig.normalised(uv)
+    scaled, pixels = rig.normalise(uv)
     p = plain(scaled, pixels, weight)
 
     # In each camera the detection that is nearest.
@@ -206,7 +206,7 @@ def _group(
             confidence += share * float(candidates[best][1].sum())
 
     # Its place and size.
-    there = p[known(p)]
+    there = p[is_known(p)]
     size = float(np.linalg.norm(np.ptp(there, axis=0)))
     centre = np.median(there, axis=0)
     return _Group(tuple(chosen), centre, size, confidence)
@@ -217,7 +217,7 @@ def _error(
 ) -> float:
     """The median error of a detection in thousandths of the focal length; infinite if unknown."""
     one = rig[[camera]]
-    scaled, pixels = one.normalised(uv[None])
+    scaled, pixels = one.normalise(uv[None])
     smallest = np.inf
 
     # Detectors may have exchanged left and right, which is corrected later.

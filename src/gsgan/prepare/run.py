@@ -4,16 +4,14 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from rich.console import Console
 
-from gsgan.check.report import Table
 from gsgan.check.run import check_capture
 from gsgan.data.pixels import read_mask_values
-from gsgan.data.skeletons import usual_step
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.rotations import between
@@ -21,10 +19,9 @@ from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import (
     FILM,
     CameraArray,
-    camera_moves,
     undistort_points,
 )
-from gsgan.prepare.clocks import DRIFT, by_time, renumbered, unsteady_clocks
+from gsgan.prepare.clocks import DRIFT, by_time, renumber, unsteady_clocks
 from gsgan.prepare.dataset import (
     Outcome,
     exists,
@@ -47,193 +44,23 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import crowded_frames, one_person
-from gsgan.prepare.solve import Solution, median, solve
+from gsgan.prepare.people import find_crowds, one_person
+from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
+from gsgan.prepare.summary import late_clocks, print_summary, summarise
 from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
-from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, known
+from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, is_known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
-from gsgan.utils.errors import DataError, explained
+from gsgan.utils.errors import DataError, explain
 from gsgan.utils.files import read_json, write_json
-from gsgan.utils.frame_files import shifted_numbers
+from gsgan.utils.frame_files import find_shifts
 from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
-TURNED = 1e-4  # degrees: less is rounding of cameras that were kept
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
-DELAY = 0.5  # frames: larger delays of a clock are noted
-CORRECTED = 1.0  # frames: whole offsets leave up to half a frame
-DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
-
-
-def summarise(outcome: Outcome) -> dict[str, Any]:
-    """The content of prepare.json; errors are medians, in pixels of the full-size image."""
-    # The numbers of each camera.
-    inputs = outcome.inputs
-    solution = outcome.solution
-    turned, moved = camera_moves(
-        CameraArray.of(inputs.cameras), solution.cameras
-    )
-    cameras = {}
-    for c, name in enumerate(inputs.sources):
-        # The errors after each stage tell which one went wrong.
-        error = solution.error[c]
-        by_stage = {
-            stage: median(px[c]) for stage, px in solution.stages.items()
-        }
-        cameras[name] = {
-            "error_px": by_stage,
-            "turned_degrees": float(turned[c]),
-            "moved_mm": float(moved[c]),
-            "flipped_share": float(solution.swapped[c].mean()),
-            "hands_px": median(error[:, HANDS]),
-            "hands_swapped": int(solution.swapped_hands[c].sum()),
-            "face_px": median(error[:, FACE]),
-            "delay_frames": float(solution.delay[c]),
-            "frames_with_person": int(np.isfinite(error).any(-1).sum()),
-            "frames_written": len(outcome.written[name]),
-        }
-
-    # Frames without an image of any camera.
-    kept = set().union(*outcome.written.values())
-    frames = outcome.frames.tolist()
-    dropped = [frame for frame in frames if frame not in kept]
-
-    # The share of frames in which each joint came out in 3D.
-    found = known(solution.p[:, :BODY]).mean(0)
-    return {
-        "error_px": {
-            stage: median(px) for stage, px in solution.stages.items()
-        },
-        "cameras": cameras,
-        "joints_found": dict(
-            zip(MEDIAPIPE33.names, found.tolist(), strict=True)
-        ),
-        "joints_removed": solution.removed,
-        "frames": len(frames),
-        "frames_dropped": dropped,
-        "fps": outcome.fps,
-        "calibration": {
-            "file": inputs.calibration.path.name,
-            "format": inputs.calibration.format,
-        },
-        "frontier_px": dict(
-            zip(("given", "refined"), solution.frontier, strict=True)
-        ),
-        "notes": [
-            *inputs.notes,
-            *_camera_notes(solution, turned),
-            *late_clocks(outcome).notes,
-        ],
-        "settings": outcome.options.record(),
-    }
-
-
-def _camera_notes(solution: Solution, turned: Float) -> list[str]:
-    """A note on whether the cameras were refined, and why."""
-    given, refined = solution.frontier
-    if not np.isfinite(given):
-        return []
-    if turned.max() > TURNED:
-        return [
-            f"the cameras were refined: silhouettes of two cameras now agree within {refined:.2f} "
-            f"pixels (median), with the given calibration {given:.2f}"
-        ]
-    return [
-        f"the given calibration was kept: silhouettes of two cameras agree within {given:.2f} "
-        f"pixels (median), refined {refined:.2f}"
-    ]
-
-
-class LateClocks(NamedTuple):
-    """What is said of clocks."""
-
-    notes: list[str]
-    wrong: bool  # whether offsets would correct them
-
-
-def late_clocks(outcome: Outcome) -> LateClocks:
-    """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
-    # Delays are counted in the chosen frames, of which only every n-th may be there.
-    solution = outcome.solution
-    step = usual_step(outcome.frames)
-    offsets = dict(outcome.options.offsets or {})
-    limit = CORRECTED if offsets else DELAY
-    late = []
-    wrong = False
-    for name, delay, gain in zip(
-        outcome.inputs.sources, solution.delay, solution.gain, strict=True
-    ):
-        if abs(delay) > DELAY and gain > DELAY_GAIN:
-            late.append(f"{name} {step * delay:+.1f}")
-            wrong = wrong or abs(delay) > limit
-            offsets[name] = offsets.get(name, 0) + round(step * delay)
-    if not late:
-        return LateClocks([], False)
-    text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
-    note = f"clocks seem late, in frames: {', '.join(late)}; set offsets={{{text}}}"
-    return LateClocks([note], wrong)
-
-
-def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
-    """Prints the numbers of the cameras and the notes."""
-    stages = numbers["error_px"]
-    cameras = numbers["cameras"]
-
-    # A row for each camera, and one for all.
-    rows: list[tuple[str, ...]] = []
-    for name, camera in cameras.items():
-        rows.append(
-            (
-                name,
-                *_errors(camera["error_px"]),
-                f"{camera['turned_degrees']:.2f}°",
-                f"{camera['moved_mm']:.0f} mm",
-                f"{camera['flipped_share']:.0%}",
-                _number(camera["delay_frames"], "+.2f"),
-                str(camera["frames_written"]),
-            )
-        )
-    rows.append(("all", *_errors(stages)))
-    headers = (
-        "camera",
-        *stages,
-        "turned",
-        "moved",
-        "swapped",
-        "late",
-        "images",
-    )
-    title = (
-        "Median error in pixels by stage; refinement, swapped sides, frames that clocks "
-        "are late"
-    )
-    console.print(Table(headers, rows).for_terminal(title))
-
-    # The notes, a line each.
-    notes = [
-        *numbers["notes"],
-        f"{numbers['frames']} frames at {numbers['fps']:g} per second",
-    ]
-    dropped = numbers["frames_dropped"]
-    if dropped:
-        notes.append(
-            f"{len(dropped)} frames were dropped: no skeleton or no mask"
-        )
-    console.print("\n".join(notes), markup=False, highlight=False)
-
-
-def _errors(by_stage: Mapping[str, float]) -> list[str]:
-    """The error after each stage as text."""
-    return [_number(error, ".2f") for error in by_stage.values()]
-
-
-def _number(value: float, form: str) -> str:
-    """The number as text; "-" for NaN."""
-    return "-" if np.isnan(value) else format(value, form)
 
 
 # incremented when the same settings begin to give another result
@@ -341,17 +168,19 @@ def _from_several(
     options: Options, inputs: Inputs, stages: StageFolder, console: Console
 ) -> Solved:
     """Several cameras: detections of one person, cameras in metres, joints in 3D."""
-    found, masks = find_people(options, inputs.sources, stages, console.print)
+    landmark_files, masks = find_people(
+        options, inputs.sources, stages, console.print
+    )
     inputs = _with_shifts(inputs, "masks", masks)
     inputs, masks = _with_times(options, inputs, masks, stages)
-    inputs, detections = with_detections(inputs, found)
+    inputs, detections = with_detections(inputs, landmark_files)
     inputs, detections = with_one_person(options, inputs, detections)
-    frames, uv, conf = _undistorted(options, inputs, detections)
+    frames, uv, conf = _undistort(options, inputs, detections)
 
     # Cameras that are not calibrated, or not in metres.
     if options.calibration == PERSON:
         people = [note for note in inputs.notes if "several people" in note]
-        with explained(people[-1] if people else None):
+        with explain(people[-1] if people else None):
             inputs = _from_person(options, inputs, frames, uv, conf, console)
     if not inputs.calibration.metric:
         inputs = _in_metres(options, inputs, uv, conf)
@@ -359,7 +188,7 @@ def _from_several(
     # The joints, and the clocks of the cameras.
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
-    solution = _solved(options, inputs, frames, uv, conf, alphas, console)
+    solution = _solve_frames(options, inputs, frames, uv, conf, alphas, console)
     return Solved(
         inputs=inputs,
         masks=masks,
@@ -388,7 +217,7 @@ def _with_shifts(
     notes = [*inputs.notes]
     for name, source in inputs.sources.items():
         others = {f"its {what}": numbers[name]}
-        for note in shifted_numbers(source.numbers(), others):
+        for note in find_shifts(source.numbers(), others):
             notes.append(note.replace("doubtful: ", f"doubtful: {name}: "))
     return replace(inputs, notes=notes)
 
@@ -428,9 +257,7 @@ def with_detections(
 def in_common(found: Detections, source: Recording) -> Detections:
     """Detections by the frame numbers that all cameras share, in place of the source's own."""
     rows = dict(enumerate(found.frame_id.tolist()))
-    by_number = renumbered(
-        {number: row for row, number in rows.items()}, source
-    )
+    by_number = renumber({number: row for row, number in rows.items()}, source)
     numbers = np.array(sorted(by_number), np.int64)
     at = [by_number[number] for number in numbers.tolist()]
     people = found.people
@@ -449,7 +276,7 @@ def with_one_person(
     """The inputs with a note on other people, and detections of one person."""
     offsets = options.offsets or {}
     if options.calibration == PERSON:
-        several = crowded_frames(detections, offsets)
+        several = find_crowds(detections, offsets)
         if not several:
             return inputs, detections
         note = (
@@ -481,7 +308,7 @@ def _with_times(
         notes=[*inputs.notes, *timed.notes],
     )
     renamed = {
-        name: renumbered(masks[name], source)
+        name: renumber(masks[name], source)
         for name, source in timed.sources.items()
     }
     return in_time, renamed
@@ -547,7 +374,7 @@ def _fingerprint(options: Options, inputs: Inputs | None) -> list[object]:
     return parts
 
 
-def _undistorted(
+def _undistort(
     options: Options, inputs: Inputs, detections: dict[str, Detections]
 ) -> tuple[Ints, Float, Float]:
     """The chosen frames ``[F]``; undistorted pixels ``[C, F, J, 2]``, confidence ``[C, F, J]``."""
@@ -590,18 +417,18 @@ def _from_person(
 ) -> Inputs:
     """The inputs with cameras that are found from the person, and notes on how well they agree."""
     with console.status("finding the cameras from the person"):
-        found = calibrate_from_person(
+        calibrated = calibrate_from_person(
             inputs.cameras, uv, conf, frames / inputs.fps, options.focal
         )
     films = np.array(
         [
             camera.K[0, 0] / np.hypot(*camera.size) * FILM
-            for camera in found.cameras
+            for camera in calibrated.cameras
         ]
     )
     notes = [*inputs.notes]
     for camera, error, film in zip(
-        found.cameras, found.error, films, strict=True
+        calibrated.cameras, calibrated.error, films, strict=True
     ):
         notes.append(
             f"{camera.name}: found from the person, {error:.1f} pixels off its landmarks, focal "
@@ -610,7 +437,7 @@ def _from_person(
 
     # A focal length unlike the others is more often an error than a zoom.
     apart = films / np.median(films)
-    for camera, ratio in zip(found.cameras, apart, strict=True):
+    for camera, ratio in zip(calibrated.cameras, apart, strict=True):
         if not 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
             notes.append(
                 f"doubtful: {camera.name} has {ratio:.1f} times the median focal length; give "
@@ -618,12 +445,12 @@ def _from_person(
             )
 
     # Cameras that look the same way show no depth.
-    if found.angle < MIN_ANGLE:
+    if calibrated.angle < MIN_ANGLE:
         notes.append(
-            f"doubtful: the cameras look at the person from within {found.angle:.0f} degrees; "
+            f"doubtful: the cameras look at the person from within {calibrated.angle:.0f} degrees; "
             "positions and focal lengths are uncertain, calibrate with a board"
         )
-    return replace(inputs, cameras=found.cameras, notes=notes)
+    return replace(inputs, cameras=calibrated.cameras, notes=notes)
 
 
 def _in_metres(
@@ -646,13 +473,11 @@ def _in_metres(
     # The body's joints in the world of the calibration.
     uv = uv[:, :, :BODY]
     C, F, J = uv.shape[:3]
-    rig, pixels = CameraArray.of(inputs.cameras).normalised(
-        uv.reshape(C, -1, 2)
-    )
+    rig, pixels = CameraArray.of(inputs.cameras).normalise(uv.reshape(C, -1, 2))
     p = robust(rig, pixels, conf[:, :, :BODY].reshape(C, -1)).p.reshape(F, J, 3)
 
     # The median over frames: single joints may be wrong.
-    seen = torch.from_numpy(known(p))
+    seen = torch.from_numpy(is_known(p))
     limbs = limb_length_sum(
         torch.from_numpy(np.nan_to_num(p)), seen
     ).nanmedian()
@@ -740,7 +565,7 @@ def _silhouettes(
     )
 
 
-def _solved(
+def _solve_frames(
     options: Options,
     inputs: Inputs,
     frames: Ints,
@@ -749,7 +574,7 @@ def _solved(
     alphas: Mapping[str, Mapping[int, Bytes]],
     console: Console,
 ) -> Solution:
-    """The joints and cameras that fit undistorted pixels, see `_undistorted`."""
+    """The joints and cameras that fit undistorted pixels, see `_undistort`."""
     # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
     C = len(cameras)
@@ -773,7 +598,7 @@ def _solved(
 def _check_distance(inputs: Inputs, p: Float) -> None:
     """Refuses a capture whose cameras are implausibly near or far; NaN in ``p [N, 3]``: missing."""
     where = inputs.calibration.path
-    seen = p[known(p)]
+    seen = p[is_known(p)]
     if not len(seen):
         raise DataError(
             f"{where}: no joint was seen by two cameras; do frame numbers agree?"
@@ -791,7 +616,7 @@ def _write_images(
 
     # Frames without a joint of the body are left out; hands and a face alone are no person.
     body = [joint for joint in range(BODY) if joint not in FROM_PARTS]
-    has_joint = known(solution.p[:, body]).any(1)
+    has_joint = is_known(solution.p[:, body]).any(1)
     posed = set(solved.frames[has_joint].tolist())
     if not posed:
         raise DataError(

@@ -38,7 +38,7 @@ from gsgan.skeleton.joints import (
     HAND_PAIRS,
     HANDS,
     WRIST_JOINTS,
-    known,
+    is_known,
 )
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
 from gsgan.utils.checks import above, at_least, whole
@@ -204,7 +204,7 @@ def solve(
     # Errors are in pixels of cameras of one focal length.
     given = cameras
     to_pixels = (given.focal / UNIT_FOCAL)[:, None, None]
-    cameras, scaled = cameras.normalised(uv)
+    cameras, scaled = cameras.normalise(uv)
     weight = np.where(conf > settings.min_confidence, conf, 0.0)
 
     # Triangulate as detected, then with left and right corrected.
@@ -217,33 +217,33 @@ def solve(
     }
 
     # Swapped sides first: they would bend the cameras.
-    found = correct(cameras, scaled, weight, time)
-    stages["flips"] = found.points.error
-    refined = refine(given, found, outlines, settings)
+    corrected = correct(cameras, scaled, weight, time)
+    stages["flips"] = corrected.points.error
+    refined = refine(given, corrected, outlines, settings)
     if refined.cameras is not given:
-        cameras, _ = refined.cameras.normalised(uv)
-        found = correct(cameras, scaled, weight, time)
-    stages["refined"] = found.points.error
+        cameras, _ = refined.cameras.normalise(uv)
+        corrected = correct(cameras, scaled, weight, time)
+    stages["refined"] = corrected.points.error
 
     # Impossible joints are removed; joints of hands and face, or all, are smoothed.
-    p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
-    final_weight = found.points.weight.reshape(conf.shape)
-    agreed = _mean_seen(final_weight, found.weight)
+    p, removed = cleanse(corrected.points.p.reshape(*conf.shape[1:], 3))
+    final_weight = corrected.points.weight.reshape(conf.shape)
+    agreed = _mean_seen(final_weight, corrected.weight)
     smoothed = smooth(p, agreed, time, settings.smoothing)
 
     # A body in smooth motion, from the views of all cameras.
-    seen = known(p)
+    seen = is_known(p)
     if settings.body and seen[:, SHOULDERS].all(1).any():
         smoothed[:, :BODY] = body_joints(
-            cameras, found.uv, found.weight, p, time, settings.noise
+            cameras, corrected.uv, corrected.weight, p, time, settings.noise
         )
     p = smoothed
-    conf_seen = _mean_seen(found.weight, found.weight)
-    inferred = np.where(known(p), INFERRED, 0.0)
+    conf_seen = _mean_seen(corrected.weight, corrected.weight)
+    inferred = np.where(is_known(p), INFERRED, 0.0)
 
     # The final errors, of detections that were used.
-    error = cameras.errors(p.reshape(-1, 3), _flat(found.uv))
-    error = np.where(found.weight > 0, error.reshape(conf.shape), np.nan)
+    error = cameras.errors(p.reshape(-1, 3), _flat(corrected.uv))
+    error = np.where(corrected.weight > 0, error.reshape(conf.shape), np.nan)
     stages["body" if settings.body else "smoothed"] = error
 
     # Errors by stage are those of the body, in pixels of each camera.
@@ -262,11 +262,11 @@ def solve(
     return Solution(
         cameras=chosen,
         p=p,
-        conf=np.where(seen & known(p), conf_seen, inferred),
+        conf=np.where(seen & is_known(p), conf_seen, inferred),
         seen=seen,
         error=error * to_pixels,
-        flips=found.flips,
-        left_out=found.left_out,
+        flips=corrected.flips,
+        left_out=corrected.left_out,
         delay=delay,
         gain=gain,
         stages=stages_in_pixels,
@@ -317,7 +317,9 @@ def refine(
     best = given
     lowest = np.inf
     for weight in LANDMARK_WEIGHTS:
-        cameras = _refined(given, found, fitted, some[::2], weight, settings)
+        cameras = _refine_cameras(
+            given, found, fitted, some[::2], weight, settings
+        )
         after = float(np.nanmedian(frontier_points(cameras, judging).error))
         if after < lowest:
             best = cameras
@@ -327,7 +329,7 @@ def refine(
     return Refined(best, (error, lowest))
 
 
-def _refined(
+def _refine_cameras(
     given: CameraArray,
     found: Corrected,
     outlines: Sequence[Sequence[Outline | None]],
@@ -341,7 +343,7 @@ def _refined(
     to_unit = (UNIT_FOCAL / given.focal)[:, None, None]
     landmarks = _flat(found.uv[:, at, :BODY])
     weight = landmark_weight * _flat(found.weight[:, at, :BODY])
-    unit, _ = given.normalised(landmarks)
+    unit, _ = given.normalise(landmarks)
 
     # The prior pulls towards the given cameras, not towards those of the last round.
     cameras = unit
@@ -349,7 +351,7 @@ def _refined(
         now = replace(given, R=cameras.R, t=cameras.t)
         touching = to_unit * frontier_points(now, outlines).uv
         both = np.concatenate([landmarks, touching], axis=1)
-        certain = known(touching).astype(np.float64)
+        certain = is_known(touching).astype(np.float64)
         weights = np.concatenate([weight, certain], axis=1)
         cameras = refine_cameras(
             given=unit,

@@ -60,8 +60,8 @@ class Recording:
         """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0, or by
         ``common``."""
         if not self.files:
-            video = opened(self.path, self.rotate)
-            for i, shown in enumerate(_decoded(video)):
+            video = open_video(self.path, self.rotate)
+            for i, shown in enumerate(_decode(video)):
                 if self.common is None:
                     yield i, shown
                 elif i in self.common:
@@ -156,13 +156,13 @@ def video_recording(path: Path, rotate: bool) -> Recording:
         DataError: when it cannot.
     """
     # What the header tells; the length may be wrong.
-    video = opened(path, rotate)
+    video = open_video(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
     count = _length(video)
 
     # The header's size may differ from that of the images.
-    first = next(_decoded(video), None)
+    first = next(_decode(video), None)
     if first is None:
         raise DataError(
             f"{path} holds no image that can be decoded; convert it to H.264 MP4"
@@ -180,7 +180,7 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     )
 
 
-def opened(path: Path, rotate: bool) -> cv2.VideoCapture:
+def open_video(path: Path, rotate: bool) -> cv2.VideoCapture:
     """A video, turned upright or as stored.
 
     Raises:
@@ -205,7 +205,7 @@ def _length(video: cv2.VideoCapture) -> int:
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
-def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
+def _decode(video: cv2.VideoCapture) -> Iterator[Bytes]:
     """The images of a video, which is closed at the end."""
     try:
         done, image = video.read()

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray
 from gsgan.scene import NEAR
-from gsgan.skeleton.joints import known
+from gsgan.skeleton.joints import is_known
 from gsgan.utils.arrays import Float, nanmedian
 
 # Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
@@ -97,7 +97,7 @@ def _robust(
     max_error: float,
 ) -> Triangulated:
     # A start that a few wrong detections do not spoil.
-    weight = np.where(known(uv), weight, 0.0)
+    weight = np.where(is_known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p = _best_pair(cameras, uv, weight, a, b)
 
@@ -211,11 +211,11 @@ def points_and_cost(
     # Frames and joints are points like any others.
     C, F, J = weight.shape
     flat = weight.reshape(C, -1)
-    found = robust(
+    result = robust(
         cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf
     )
 
     # Points that were not found cost nothing here: they would favour no side.
-    seen = np.where(np.isfinite(found.error), flat, 0.0)
-    cost = robust_cost(found.error, seen)
-    return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
+    seen = np.where(np.isfinite(result.error), flat, 0.0)
+    cost = robust_cost(result.error, seen)
+    return result.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)

@@ -17,7 +17,7 @@ from PIL import Image
 
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
-from gsgan.utils.provenance import marked_mp4, png_bytes
+from gsgan.utils.provenance import mark_mp4, png_bytes
 
 Bytes = NDArray[np.uint8]
 
@@ -95,8 +95,8 @@ class Output:
         """
         # A video is written when its last frame is encoded.
         if self.video:
-            data = encoded(images, self.fps)
-            data = marked_mp4(data) if self.marked else data
+            data = encode_video(images, self.fps)
+            data = mark_mp4(data) if self.marked else data
             write_atomically(self.out, data)
             return
 
@@ -116,7 +116,7 @@ def _av() -> Any:
     return av
 
 
-def encoded(images: Iterable[Bytes], fps: float) -> bytes:
+def encode_video(images: Iterable[Bytes], fps: float) -> bytes:
     """An MP4 file of images ``[H, W, 3]``, H.264; odd sides repeat their last row or column."""
     # The file is made in memory, since it is written completely or not at all.
     av = _av()

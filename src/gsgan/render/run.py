@@ -19,11 +19,11 @@ from gsgan.render.output import Output
 from gsgan.run.drive import (
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
     inputs_of,
     joints_of,
-    smoothed,
+    smooth,
 )
 from gsgan.run.runs import Run, marks_of
 from gsgan.scene import Camera, cat
@@ -53,13 +53,13 @@ def render_config(config: DictConfig) -> None:
     motion = MotionOptions.from_config(config)
     run = Run.from_config(config)
     if config.distilled:
-        run.avatar = distilled_of(motion, run)
+        run.avatar = distil_run(motion, run)
     for mark in marks_of(run.checkpoint):
         console.print(mark, markup=False, highlight=False, soft_wrap=True)
 
     # The motion, and the camera of each frame.
-    drive = smoothed(config.smooth, drive_of(motion, run, fps), fps)
-    drive = _chosen(drive, config, fps)
+    drive = smooth(config.smooth, drive_of(motion, run, fps), fps)
+    drive = _choose(drive, config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
     record = {
@@ -120,7 +120,7 @@ def _output(config: DictConfig) -> Output:
     return Output(out, float(above("fps", config.fps)), bool(config.provenance))
 
 
-def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
+def _choose(drive: Drive, config: DictConfig, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
     # The first frame must exist.
     start = whole("start", config.start, 0)
@@ -199,7 +199,7 @@ def of_entry(
         p: ``[F, 33, 3]`` metres, world frame.
         size: pixels.
         crop: of the training images, or None.
-        lens: keep its distortion, see `CameraEntry.seen`.
+        lens: keep its distortion, see `CameraEntry.view_of`.
     """
     # One window for all frames, so that the camera stands still.
     window = square_window(entry.size)
@@ -208,7 +208,7 @@ def of_entry(
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
         kept = lens and entry.keeps_lens
         window = crop.window(entry, joints, known, lens=kept)
-    return entry.seen(window, (size, size), lens=lens)
+    return entry.view_of(window, (size, size), lens=lens)
 
 
 def from_file(
@@ -239,14 +239,14 @@ def from_file(
         )
 
     # One camera for all frames, or one for each; both need an image size for their window.
-    found = list(calibration.cameras.values())
-    if len(found) not in (1, len(p)):
+    cameras = list(calibration.cameras.values())
+    if len(cameras) not in (1, len(p)):
         raise DataError(
-            f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one per frame"
+            f"{path} holds {len(cameras)} cameras; expected 1, or {len(p)}, one per frame"
         )
-    if any(0 in entry.size for entry in found):
+    if any(0 in entry.size for entry in cameras):
         raise DataError(f"{path} lacks an image size; every camera needs one")
-    return cat([of_entry(entry, p, size, None, lens=True) for entry in found])
+    return cat([of_entry(entry, p, size, None, lens=True) for entry in cameras])
 
 
 # -- images
@@ -275,14 +275,14 @@ def _images(
             with torch.no_grad():
                 # Frame by frame: a long motion does not fit into the memory.
                 p, visibility, body = inputs_of(run.avatar, drive, i)
-                found = run.avatar(
+                rendering = run.avatar(
                     p, visibility, camera, body, colours, maps=False
                 )
-            assert found.image is not None
-            assert found.alpha is not None
+            assert rendering.image is not None
+            assert rendering.alpha is not None
             yield eight_bits(
-                found.image[0].cpu(),
-                found.alpha[0].cpu(),
+                rendering.image[0].cpu(),
+                rendering.alpha[0].cpu(),
                 paint_on(camera.size),
             )
         except ValueError as error:

@@ -63,17 +63,17 @@ class PaperTable:
         note = f"{AS_PRINTED} in {self.title}"
         if self.note:
             note += f"; {self.note}"
-        found: dict[str, list[Row]] = {}
+        by_model: dict[str, list[Row]] = {}
         for held in self.rows:
             texts = []
             for column, metric in columns.items():
                 subject = self.subject if column == metric else column
                 texts.append(held["values"].get(subject, {}).get(metric))
             row = self._row(held["label"], texts, (note,))
-            found.setdefault(held.get("beside") or held["label"], []).append(
+            by_model.setdefault(held.get("beside") or held["label"], []).append(
                 row
             )
-        return found
+        return by_model
 
     def grid(self, why: str) -> Grid:
         """The whole printed table: a row for each of its rows and subjects."""

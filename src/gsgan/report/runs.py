@@ -18,7 +18,7 @@ from gsgan.evaluate.files import FACTS_FILE, METRICS_FILE
 from gsgan.run.stored import CONFIG, hydra_record, read_yaml, record
 from gsgan.utils.config import flat
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.sweeps import unfinished
+from gsgan.utils.sweeps import why_unfinished
 
 DATA = "data (cameras, frames, split, image size, crop or fitted poses)"
 SCORE_TOLERANCE = 1e-3  # between equal floats, for rounding
@@ -68,7 +68,7 @@ class ScoredRun:
         variants = self.scores.get(split, {}).values()
         return max((int(scores["images"]) for scores in variants), default=0)
 
-    def stated(self, key: str, *splits: str) -> Any:
+    def first_value(self, key: str, *splits: str) -> Any:
         """The first value of ``key`` in the scores of some or all splits; None if none has it."""
         for split in splits or self.scores:
             for scores in self.scores.get(split, {}).values():
@@ -78,7 +78,7 @@ class ScoredRun:
 
     def protocol(self, *splits: str) -> dict[str, Any]:
         """The record of the published protocol in the scores of some or all splits."""
-        return self.stated("protocol", *splits) or {"name": "none"}
+        return self.first_value("protocol", *splits) or {"name": "none"}
 
     def is_of(self, subjects: Sequence[str]) -> bool:
         """Whether the data are a subject's: ``CoreView_377`` and ``my_377`` are both 377's."""
@@ -98,7 +98,7 @@ class ScoredRun:
         short = name[:9] if len(name) == 40 else name
         return f"{short} + changes" if self.facts.get("dirty") else short
 
-    def planned(self, *, segmentation: bool) -> int:
+    def plan_length(self, *, segmentation: bool) -> int:
         """Iterations of the whole schedule, 0 if there is none; ``segmentation`` adds the phase of
         its own, which not every scene has."""
         start = "training.schedule."
@@ -158,7 +158,7 @@ def find_runs(given: Sequence[str]) -> list[Path]:
         ConfigError: when an entry contains no run.
     """
     # A dict keeps the order, and has each folder once.
-    found: dict[Path, None] = {}
+    folders: dict[Path, None] = {}
     for entry in given:
         places = [str(Path(entry).expanduser())]
         if glob.has_magic(entry):
@@ -171,8 +171,8 @@ def find_runs(given: Sequence[str]) -> list[Path]:
                 f"runs: {entry!r} contains no run folder ({METRICS_FILE} or {CONFIG}); give run "
                 "folders, folders of them or globs"
             )
-        found |= dict.fromkeys(runs)
-    return list(found)
+        folders |= dict.fromkeys(runs)
+    return list(folders)
 
 
 def _runs_inside(folder: Path) -> Iterator[Path]:
@@ -211,7 +211,7 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
     for name in (METRICS_FILE, FACTS_FILE):
         if scored and not (folder / name).is_file():
             why = (
-                unfinished(folder)
+                why_unfinished(folder)
                 or "the run is not finished, or was not scored"
             )
             raise DataError(f"{folder}: no {name}; {why}")
@@ -255,7 +255,7 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
 
     # A run may have been scored before its end.
     done = facts.get("iterations")
-    planned = run.planned(segmentation=False)
+    planned = run.plan_length(segmentation=False)
     if scored and done is not None and done < planned:
         raise DataError(
             f"{folder}: scored after {done} of at least {planned} iterations"

@@ -12,7 +12,7 @@ from gsgan.utils.errors import ConfigError
 MEAN = "mean"  # the column over subjects
 
 
-def written(metric: str, value: float, *, times_1000: bool = False) -> str:
+def format_value(metric: str, value: float, *, times_1000: bool = False) -> str:
     """A value with the metric's digits and a typographic minus; zero has no sign.
 
     A value that was multiplied by 1000 has two digits fewer.

@@ -28,7 +28,7 @@ from gsgan.report.spec import (
     MEAN,
     RowSpec,
     TableSpec,
-    written,
+    format_value,
 )
 from gsgan.report.write import (
     NO_RUN,
@@ -84,7 +84,7 @@ class Part:
         # Inputs of LPIPS differ between protocols.
         name = METRICS[metric].name
         described = join_unique(
-            run.stated("lpips_input", self.split) for run in self.runs
+            run.first_value("lpips_input", self.split) for run in self.runs
         )
         if metric.startswith("lpips") and described:
             name = f"{name} {described}"
@@ -92,9 +92,11 @@ class Part:
             name = f"{name} ×1000"
         return f"{name} {METRICS[metric].better}".rstrip()
 
-    def written(self, metric: str, value: float) -> str:
+    def write_value(self, metric: str, value: float) -> str:
         """A value of this table, with the metric's digits."""
-        return written(metric, value, times_1000=metric in self.spec.times_1000)
+        return format_value(
+            metric, value, times_1000=metric in self.spec.times_1000
+        )
 
     def of(self, name: str | None, column: str = MEAN) -> list[ScoredRun]:
         """The runs of a model or method (None: of all) that a column shows."""
@@ -216,16 +218,16 @@ class Part:
 
         # The spread is printed with the digits of the mean.
         mean = float(values.mean())
-        text = self.written(metric, mean)
+        text = self.write_value(metric, mean)
         spread = None
         if len(values) > 1:
             spread = float(values.std())
-            text += f" ± {self.written(metric, spread)}"
+            text += f" ± {self.write_value(metric, spread)}"
 
         # The deviation over poses is a mean over seeds.
         poses = own.poses.mean()
         if not pd.isna(poses):
-            text += f" ({self.written(metric, float(poses))})"
+            text += f" ({self.write_value(metric, float(poses))})"
         return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:
@@ -275,7 +277,7 @@ def _column_facts(
     record = run.protocol(split)
     facts = {
         "protocol": record["name"],
-        "LPIPS": run.stated("lpips_input", split),
+        "LPIPS": run.first_value("lpips_input", split),
         "boxes of hands and mouth": _boxes(run, part),
         UNCOMMITTED: None if allow_dirty else bool(run.facts.get("dirty")),
     }
@@ -467,8 +469,10 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
         departures = [run.departures for run in runs]
         if None in departures:
             notes.append("no config says whether it is experiment=paper")
-        elif found := next(filter(None, departures), None):
-            notes.append(f"differs from experiment=paper: {', '.join(found)}")
+        elif departure := next(filter(None, departures), None):
+            notes.append(
+                f"differs from experiment=paper: {', '.join(departure)}"
+            )
         else:
             whole = (spec.run, spec.variant) == ("full", FULL)
             label = NAME if whole else f"{NAME}, {label}"
@@ -506,10 +510,10 @@ def _value(
 
 def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     """Marks the best of our rows in each column that several of them have."""
-    found = [list(row.cells) for row in rows]
+    cells_by_row = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
         means = []
-        for cells in found:
+        for cells in cells_by_row:
             mean = cells[i].mean
             if mean is not None:
                 means.append(mean)
@@ -528,14 +532,14 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
             best = min(means, key=lambda mean: abs(mean - 1))
 
         # Values that are printed alike are all marked.
-        printed = part.written(metric, best)
-        for cells in found:
+        printed = part.write_value(metric, best)
+        for cells in cells_by_row:
             mean = cells[i].mean
-            if mean is not None and part.written(metric, mean) == printed:
+            if mean is not None and part.write_value(metric, mean) == printed:
                 cells[i] = replace(cells[i], best=True)
     return [
         replace(row, cells=cells)
-        for row, cells in zip(rows, found, strict=True)
+        for row, cells in zip(rows, cells_by_row, strict=True)
     ]
 
 
@@ -566,4 +570,4 @@ def _boxes(run: ScoredRun, part: Part) -> str | None:
     # Without such a metric, runs of different boxes are comparable.
     if set(BOX_METRICS).isdisjoint(part.columns.values()):
         return None
-    return run.stated("boxes", part.split)
+    return run.first_value("boxes", part.split)

@@ -33,7 +33,7 @@ from gsgan.model.generator import Generator
 from gsgan.model.residual_gaussians import ResidualGaussians
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.run.class_vote import labelled_body
+from gsgan.run.class_vote import label_body
 from gsgan.scene import Frame
 from gsgan.skeleton import Densify, SkeletonTemplate, template_of
 from gsgan.splat import BACKENDS, Accuracy
@@ -56,7 +56,7 @@ OPTIONS = (
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
     # Images are undistorted when they are read, so the dataset knows that effect.
-    distortion = _effect_settings(config).requested("distortion")
+    distortion = _effect_settings(config).value_of("distortion")
     data: GsganData = instantiate(config.data, distortion=distortion)
     data.prepare_data()
     data.setup()
@@ -72,7 +72,7 @@ def moves_with_body(config: DictConfig) -> bool:
         or model.get("surface") is not None
     ):
         return True
-    on_body = _effect_settings(config).requested("body_points") != OFF
+    on_body = _effect_settings(config).value_of("body_points") != OFF
     return model.get("body_points") is not None and on_body
 
 
@@ -119,8 +119,8 @@ def build_avatar(
             "the model leaves it out",
         )
         if parts.segmentation is not None:
-            labelled = labelled_body(scene, images, vertex_labels)
-        return _assembled(parts, scene, effects, labelled, config.seed)
+            labelled = label_body(scene, images, vertex_labels)
+        return _assemble(parts, scene, effects, labelled, config.seed)
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class AvatarParts:
         )
 
 
-def _assembled(
+def _assemble(
     parts: AvatarParts,
     scene: SceneInfo,
     effects: Effects,
@@ -229,7 +229,7 @@ def _assembled(
             **_set_by_scene(parts, scene, effects, body_points),
         )
     if parts.surface:
-        body = _required_body(scene, "model.surface")
+        body = _require_body(scene, "model.surface")
         surface = parts.surface(body=body, **sizes)
 
     # S forms its images like F.
@@ -244,7 +244,7 @@ def _assembled(
     # Parts on a body need its solver for skeletons without a body pose.
     solver = None
     if body_points or surface or segmentation:
-        solver = Solver(_required_body(scene, "the model"))
+        solver = Solver(_require_body(scene, "the model"))
 
     # The rest: the generator and the colour corrections.
     torch.manual_seed(seed + 2)
@@ -289,7 +289,7 @@ def _body_points(
     if not (parts.densify and parts.body_points and effects.body_points.on):
         return None
     return parts.body_points(
-        body=_required_body(scene, "effects.body_points=on"),
+        body=_require_body(scene, "effects.body_points=on"),
         stature=stature,
         scale=scene.scale_train[1],
     )
@@ -302,20 +302,20 @@ def _set_by_scene(
     body_points: BodyPoints | None,
 ) -> dict[str, Any]:
     """Arguments of Ψ that the scene or the points decide."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     if body_points is not None:
-        found["mean_step"] = body_points.mean_step
+        settings["mean_step"] = body_points.mean_step
         if body_points.scale_max is not None:
-            found["scale_max"] = body_points.scale_max
+            settings["scale_max"] = body_points.scale_max
 
     # A config with normals=null leaves it to the number of cameras.
     given = getattr(parts.deformation, "keywords", {})
     if given.get("normals", False) is None:
-        found["normals"] = scene.n_train_cameras > 1
+        settings["normals"] = scene.n_train_cameras > 1
     if effects.light.on:
         assert scene.proportions is not None
-        found["light"] = scene.proportions.up
-    return found
+        settings["light"] = scene.proportions.up
+    return settings
 
 
 def _generator(
@@ -368,7 +368,7 @@ def naming_group(group: str) -> Iterator[None]:
         ) from error
 
 
-def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
+def _require_body(scene: SceneInfo, part: str) -> MarkedBody:
     if not scene.has_body_pose:
         raise DataError(
             f"{part} cannot be built: the data lacks a body pose for every frame; choose "

@@ -27,7 +27,7 @@ MAX_RADIUS_CELLS = 8
 MAX_CELLS = 2048  # along a side of the depth map
 
 
-def labelled_body(
+def label_body(
     scene: SceneInfo,
     images: Subset[Frame] | None = None,
     vertex_labels: Tensor | None = None,
@@ -78,7 +78,7 @@ def labelled_body(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
             )
-        return body.voted(
+        return body.with_labels(
             vertex_labels, names
         ), "parts voted when training began"
 
@@ -89,7 +89,7 @@ def labelled_body(
             "and there is no training image with labels to vote on them; choose model=wo_seg"
         )
     votes = class_vote(body, images, len(names))
-    body = body.voted(votes.labels, names)
+    body = body.with_labels(votes.labels, names)
     missing = len(names) - 1 - len(votes.labels.unique())
     return body, (
         f"class vote over {votes.images} images: {votes.decided:.0%} of the vertices decided, "
@@ -150,7 +150,7 @@ def _count(
 
     # The pixel of each vertex, and whether the vertex is hidden.
     posed = body.posed_vertices(frame.body)[0]
-    shown = seen(posed, reach, frame.camera, DEPTH_TOLERANCE)
+    shown = find_visible(posed, reach, frame.camera, DEPTH_TOLERANCE)
     pixel, _ = frame.camera.project(posed[None])
     column, row = pixel[0].floor().long().unbind(-1)
 
@@ -164,7 +164,7 @@ def _count(
     votes[vertex[valid], label[valid]] += 1
 
 
-def seen(
+def find_visible(
     points: Tensor, reach: Tensor, camera: Camera, tolerance: float
 ) -> Tensor:
     """``[V]`` bool: points not hidden behind others, each a disc that faces the camera.

@@ -15,24 +15,24 @@ from torch import Tensor
 
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import distilled
+from gsgan.model.harmonic import distil
 from gsgan.motion.clip import (
     FPS,
     Clip,
-    checked,
-    completed,
+    complete,
     frame_times,
     is_own,
-    resampled,
+    mask_unseen,
+    resample,
     up_axis,
 )
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import (
-    expressed,
     face_in_head,
-    joined,
-    placed,
-    retargeted,
+    join,
+    place,
+    retarget,
+    transfer_face,
 )
 from gsgan.motion.smooth import OneEuro
 from gsgan.run.runs import Run
@@ -147,11 +147,11 @@ def drive_of(options: MotionOptions, run: Run, fps: float) -> Drive:
         DataError: when the motion cannot be read.
     """
     # With drive=skeleton the body follows from the joints, as for a motion without one.
-    found = _chosen(options, run, fps)
-    return found if options.drive is None else replace(found, body=None)
+    drive = _choose(options, run, fps)
+    return drive if options.drive is None else replace(drive, body=None)
 
 
-def smoothed(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
+def smooth(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
     """The motion after the filter of the config group ``smooth``, if it is enabled.
 
     Joints are smoothed from the past alone. Body poses follow from them.
@@ -163,27 +163,27 @@ def smoothed(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
     own = dict(settings)
     if not own.pop("enabled"):
         return drive
-    smooth = OneEuro(**own)
+    one_euro = OneEuro(**own)
 
     # Held-out frames may be apart; then the filter starts anew.
     joints = []
     for number, p in zip(drive.numbers, drive.p, strict=True):
-        joints.append(smooth(p, number / fps))
+        joints.append(one_euro(p, number / fps))
     return replace(
         drive, p=np.stack(joints), body=None, text=f"{drive.text}, smoothed"
     )
 
 
-def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
+def _choose(options: MotionOptions, run: Run, fps: float) -> Drive:
     """The motion of options: files, a split, the rest pose, or one held-out frame."""
     # Without a motion: one held-out frame, held still. A shared avatar has no frames.
     if options.motion is None and run.is_shared:
         return rest_pose(run.proportions)
     if options.motion is None:
         split, _ = run.data.watched
-        found = _held_out(options, run, split)
-        frame = found.numbers[0]
-        still = found.rows(np.zeros(1, np.int64))
+        drive = _read_split(options, run, split)
+        frame = drive.numbers[0]
+        still = drive.rows(np.zeros(1, np.int64))
         return replace(
             still, text=f"frame {frame} of {split}, held still", camera=None
         )
@@ -197,17 +197,17 @@ def _chosen(options: MotionOptions, run: Run, fps: float) -> Drive:
         clips = [
             _from_file(options, run, str(path), fps) for path in options.motion
         ]
-        return _joined(clips, run.proportions, options.transition, fps)
+        return _join(clips, run.proportions, options.transition, fps)
 
     # A name, or else a file.
     if options.motion == REST:
         return rest_pose(run.proportions)
     if options.motion in SPLITS:
-        return _held_out(options, run, options.motion)
+        return _read_split(options, run, options.motion)
     return _from_file(options, run, options.motion, fps)
 
 
-def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
+def _read_split(options: MotionOptions, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = run.data.dataset(split)
     if not dataset.items:
@@ -259,7 +259,7 @@ def _held_out(options: MotionOptions, run: Run, split: str) -> Drive:
     )
 
 
-def _joined(
+def _join(
     clips: list[Drive], proportions: Proportions, seconds: float, fps: float
 ) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
@@ -280,21 +280,21 @@ def _joined(
         )
         parts.append(padded @ standard.T)
 
-    # Frames between two clips are made by `joined`.
+    # Frames between two clips are made by `join`.
     between = max(1, round(seconds * fps) - 1)
-    p = joined(parts, proportions, between) @ standard
+    p = join(parts, proportions, between) @ standard
 
     names = "; ".join(clip.text for clip in clips)
     return Drive(
         p=p,
-        visibility=_shown(p, proportions),
+        visibility=_make_visibility(p, proportions),
         body=None,
         numbers=list(range(len(p))),
         text=f"{names}; {seconds:g} s from each to the next",
     )
 
 
-def _shown(p: Float, proportions: Proportions) -> Float:
+def _make_visibility(p: Float, proportions: Proportions) -> Float:
     """Visibility ``[F, J]`` of retargeted joints: the body's as in training, 1 for others that are
     known."""
     # The body's landmarks are as visible as they were in training.
@@ -325,13 +325,13 @@ def _from_file(
     body = None
     if own:
         nearest = np.rint(frame_times(len(motion), rate, fps)).astype(int)
-        p = resampled(motion.p, rate, fps)
+        p = resample(motion.p, rate, fps)
         visibility = motion.visibility[nearest]
         if motion.body is not None and run.avatar.needs_body:
             body = motion.body[torch.from_numpy(nearest)]
     else:
         p = _on_subject(options, run, motion, up, rate, fps)
-        visibility = _shown(p, run.proportions)
+        visibility = _make_visibility(p, run.proportions)
 
     # One line on what was read and what was made of it.
     bones = "bones as they are" if own else "on the subject's bones"
@@ -369,7 +369,9 @@ def _clip(options: MotionOptions, run: Run, path: Path) -> Clip:
         up=options.up,
         animation=None if animation is None else str(animation),
     )
-    motion = checked(read_motion(path, source), float(options.min_visibility))
+    motion = mask_unseen(
+        read_motion(path, source), float(options.min_visibility)
+    )
     _refuse_swapped(motion)
 
     # Joints that belong to no bones have to be retargeted.
@@ -400,12 +402,12 @@ def _on_subject(
     proportions = run.proportions
     standard = upright(proportions.up)
     centre = standard @ np.array(run.scene.centre)
-    p = completed(motion, up)
+    p = complete(motion, up)
     if p.shape[1] > FACE.start:
         p = p if motion.detached else face_in_head(p)
-        p[:, FACE] = expressed(p[:, FACE], run.face)
-    p = retargeted(resampled(p, rate, fps), proportions)
-    p = placed(
+        p[:, FACE] = transfer_face(p[:, FACE], run.face)
+    p = retarget(resample(p, rate, fps), proportions)
+    p = place(
         p,
         proportions,
         centre,
@@ -488,13 +490,13 @@ def inputs_of(
     return p, visibility, avatar.body_pose(p, visibility)
 
 
-def distilled_of(options: MotionOptions, run: Run) -> Avatar:
+def distil_run(options: MotionOptions, run: Run) -> Avatar:
     """A run's avatar with Ψ's residuals as linear functions, fitted over training poses: see
-    `gsgan.model.harmonic.distilled`. The offsets of pose are part of them."""
+    `gsgan.model.harmonic.distil`. The offsets of pose are part of them."""
     # The fit takes poses at even distances, from the first to the last.
     drive = drive_of(replace(options, motion="train"), run, 1.0)
     chosen = evenly_spaced(len(drive.p), DISTILLED, ends=True)
-    return distilled(
+    return distil(
         run.avatar,
         (inputs_of(run.avatar, drive, i) for i in chosen),
         keep_offsets=False,

@@ -33,7 +33,7 @@ from gsgan.run.stored import (
     load_config,
     read_checkpoint,
     read_config,
-    stored_scene,
+    read_scene,
 )
 from gsgan.skeleton import HOLISTIC
 from gsgan.skeleton.proportions import Proportions
@@ -101,12 +101,12 @@ def load_avatar(
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     body = data.layout.meta.body
     scene = replace(
-        stored_scene(checkpoint["gsgan"]["scene"]),
+        read_scene(checkpoint["gsgan"]["scene"]),
         body_file=None if body is None else body.file,
         camera_names=data.layout.camera_names,
     )
     marks = marks_of(checkpoint["gsgan"])
-    return _trained(folder, config, checkpoint, scene), marks
+    return _load_trained(folder, config, checkpoint, scene), marks
 
 
 def marks_of(facts: Mapping[str, Any]) -> list[str]:
@@ -135,12 +135,14 @@ def avatar_of(
         smpl: as for `load`.
     """
     # The body model file may lie elsewhere than when the avatar was trained.
-    scene = stored_scene(checkpoint["gsgan"]["scene"])
+    scene = read_scene(checkpoint["gsgan"]["scene"])
     file = absolute_path(folder, scene.body_file) if smpl is None else smpl
-    return _trained(folder, config, checkpoint, replace(scene, body_file=file))
+    return _load_trained(
+        folder, config, checkpoint, replace(scene, body_file=file)
+    )
 
 
-def _trained(
+def _load_trained(
     folder: Path,
     config: DictConfig,
     checkpoint: dict[str, Any],
@@ -269,7 +271,7 @@ class Run:
     @property
     def scene(self) -> SceneInfo:
         """Facts about the scene."""
-        return stored_scene(self.checkpoint["scene"])
+        return read_scene(self.checkpoint["scene"])
 
     @property
     def body(self) -> MarkedBody | None:

@@ -61,11 +61,11 @@ def find_avatar(name: str | Path) -> Path:
     if str(name) == DEMO:
         return DEMO_FOLDER
     if REPOSITORY.fullmatch(str(name)):
-        return _downloaded(str(name))
+        return _download(str(name))
     return folder  # its reader says what is missing
 
 
-def _downloaded(name: str) -> Path:
+def _download(name: str) -> Path:
     try:
         from huggingface_hub import constants, snapshot_download
         from huggingface_hub.errors import HFValidationError, HTTPError
@@ -113,7 +113,7 @@ def read_shared(folder: Path) -> tuple[DictConfig, dict[str, Any]]:
             f"{path}: not the config of a gsgan avatar (expected entries "
             f"{', '.join(sorted(ENTRIES))})"
         )
-    config = checked_config(path, content["config"])
+    config = check_config(path, content["config"])
     state, _ = read_weights(folder / WEIGHTS_FILE)
     return config, {"gsgan": content["gsgan"], "state_dict": state}
 
@@ -149,7 +149,7 @@ def refusing_damage(path: Path) -> Iterator[None]:
         ) from None
 
 
-def checked_config(path: Path, plain: Any) -> DictConfig:
+def check_config(path: Path, plain: Any) -> DictConfig:
     """The part of a config that an avatar is built from, of one that may come from anybody.
 
     Interpolations are resolved. A config names the classes that it builds: only those in conf/ are

@@ -19,17 +19,6 @@ from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.errors import ConfigError, DataError
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
-# Classes that configs of runs before 2026-11-26 name by another module.
-MOVED = {"gsgan.model.assemble.": "gsgan.run.assemble."}
-# Keys that configs of runs before 2026-11-27 have, and their last part now.
-RENAMED_KEYS = {
-    "data.reader.consistency.least_inside": "refused_below",
-    "fit.least_mask": "min_mask",
-    "model.window_least": "window_minimum",
-    "training.rollback.most": "max_restorations",
-}
-# Keys that configs of runs before 2026-11-28 have, and the only value that there is now.
-REMOVED_KEYS = {"model.deformation.pose_frame": "world"}
 # Keys that configs of runs before 2026-11-29 have, and that nothing reads now.
 UNREAD_KEYS = ("effects.generator", "effects.gaussians_per_pixel")
 CONFIG = Path(".hydra") / "config.yaml"
@@ -106,17 +95,13 @@ def read_config(folder: Path) -> DictConfig:
 
 
 def read_yaml(path: Path) -> DictConfig:
-    """A file of Hydra's in a run folder, with the present names of classes and keys.
+    """A file of Hydra's in a run folder, without the keys that nothing reads now.
 
     Raises:
         DataError: when it is damaged.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-        # Runs of earlier versions name classes by modules that have moved.
-        for before, now in MOVED.items():
-            text = text.replace(before, now)
-        config = OmegaConf.create(text)
+        config = OmegaConf.create(path.read_text(encoding="utf-8"))
     except (
         UnicodeDecodeError,
         yaml.YAMLError,
@@ -127,33 +112,15 @@ def read_yaml(path: Path) -> DictConfig:
         ) from None
     if not isinstance(config, DictConfig):
         raise DataError(f"{path}: damaged (expected keys with values)")
-    rename_keys(config)
+    drop_unread(config)
     return config
 
 
-def rename_keys(settings: MutableMapping[str, Any]) -> None:
-    """Gives a config, or its `record`, the keys of now, in place.
-
-    Raises:
-        ConfigError: when a key that is gone had another value than the code has now.
-    """
-    # Keys with another name now.
-    for before, now in RENAMED_KEYS.items():
-        group, last = _group(settings, before)
-        if last in group:
-            group[now] = group.pop(last)
-
-    # Keys that are gone.
+def drop_unread(settings: MutableMapping[str, Any]) -> None:
+    """Removes `UNREAD_KEYS` from a config, or from its `record`, in place."""
     for key in UNREAD_KEYS:
         group, last = _group(settings, key)
         group.pop(last, None)
-    for key, value in REMOVED_KEYS.items():
-        group, last = _group(settings, key)
-        if group.pop(last, value) != value:
-            raise ConfigError(
-                f"the run was trained with another {key} than {value}, which this version "
-                "of gsgan does not have; use the version that it was trained with"
-            )
 
 
 def _group(
@@ -162,8 +129,10 @@ def _group(
     """The group that a dotted key belongs to, empty where there is none, and its last part."""
     *groups, last = key.split(".")
     for group in groups:
-        found = settings.get(group)
-        settings = found if isinstance(found, MutableMapping) else {}
+        group_settings = settings.get(group)
+        settings = (
+            group_settings if isinstance(group_settings, MutableMapping) else {}
+        )
     return settings, last
 
 
@@ -216,11 +185,11 @@ def hydra_record(folder: Path) -> DictConfig:
 
 def choices(folder: Path) -> dict[str, Any]:
     """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
-    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    recorded = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
     return (
         {}
-        if found is None
-        else {str(key): value for key, value in found.items()}
+        if recorded is None
+        else {str(key): value for key, value in recorded.items()}
     )
 
 
@@ -270,7 +239,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
+def read_scene(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
     # Checkpoints hold lists for tuples, and dicts for dataclasses.
     values: dict[str, Any] = {}
@@ -287,7 +256,4 @@ def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
     # Called by another name until 2026-11-29.
     if "body_height" in values:
         values["limb_length_sum"] = values.pop("body_height")
-
-    # Stored until 2026-11-26; nothing depends on it now.
-    values.pop("scale_test", None)
     return SceneInfo(**values)

@@ -211,9 +211,11 @@ class Densify(nn.Module):
 
         # The unit shapes.
         if sampler == "trimesh":
-            cylinder = shipped("cylinder", n_limb)
-            sphere = shipped("sphere", n_face)
-            box = shipped("box" if self.torso == "cube" else "box_fit", n_torso)
+            cylinder = load_samples("cylinder", n_limb)
+            sphere = load_samples("sphere", n_face)
+            box = load_samples(
+                "box" if self.torso == "cube" else "box_fit", n_torso
+            )
         else:
             extents = (1.0, 1.0, 1.0) if self.torso == "cube" else torso_rest
             cylinder = even_cylinder(n_limb)
@@ -223,10 +225,8 @@ class Densify(nn.Module):
         # Each limb has a cylinder along its direction at rest.
         along = _limb_axes(t).mT.numpy()
         finger = even_cylinder(n_bone)
-        limbs = _turned(cylinder, self.radius_ratio, along[list(t.measured)])
-        bones = _turned(
-            finger, self.finger_radius_ratio, along[list(t.fingers)]
-        )
+        limbs = _turn(cylinder, self.radius_ratio, along[list(t.measured)])
+        bones = _turn(finger, self.finger_radius_ratio, along[list(t.fingers)])
 
         # Names with an underscore follow from the settings: checkpoints do not
         # hold them.
@@ -339,12 +339,12 @@ class Densify(nn.Module):
             rotations=rotations,
             origins=origins + root,
             scales=sigma.index_select(1, self.part_id),
-            valid=self._seen(valid).index_select(1, self.part_id),
+            valid=self._find_parts(valid).index_select(1, self.part_id),
             part_id=self.part_id,
             normals=turned.squeeze(-1),
         )
 
-    def _seen(self, valid: Tensor) -> Tensor:
+    def _find_parts(self, valid: Tensor) -> Tensor:
         """``[B, P]`` whether each part is seen, of joints ``[B, J]``."""
         # Each part needs other joints: both ends, any of the face, three of the trunk.
         c = constants(self.template, valid.device, self.template_points.dtype)
@@ -408,7 +408,7 @@ def _limb_axes(template: SkeletonTemplate) -> Tensor:
     return Swing.of(up).to(rest.unsqueeze(1)).squeeze(1)
 
 
-def _turned(cylinder: Samples, radius: float, axes: Array) -> Samples:
+def _turn(cylinder: Samples, radius: float, axes: Array) -> Samples:
     """Cylinders ``[L, n, 3]`` of a radius, along the axes ``[L, 3, 3]`` of limbs."""
     points = cylinder.points * [radius, radius, 1.0]
     return Samples(points @ axes, cylinder.normals @ axes)
@@ -461,7 +461,7 @@ def even_box(
     return Samples(np.concatenate(points), np.concatenate(normals))
 
 
-def shipped(shape: str, n: int) -> Samples:
+def load_samples(shape: str, n: int) -> Samples:
     """The stored random samples of a shape: cylinder, sphere, box, or box_fit.
 
     ``templates.npz`` was sampled once with trimesh (scripts/make_skeleton_templates.py), so that

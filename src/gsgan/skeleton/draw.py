@@ -178,10 +178,10 @@ def _distances2(
         length.split(counts, dim=1),
         strict=True,
     )
-    found = []
+    distances = []
     for box, along_x, along_y, across_x, across_y, length in groups:
         rows, columns = box
-        found.append(
+        distances.append(
             _nearest(
                 along_x[..., columns],
                 along_y[..., rows, :],
@@ -190,7 +190,7 @@ def _distances2(
                 length,
             )
         )
-    return found
+    return distances
 
 
 def _nearest(

@@ -89,7 +89,7 @@ def face_mirror(start: int) -> tuple[int, ...]:
 def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
     """Connections, by the names of the drawn channels: lips and lids are rings, brows chains."""
 
-    def joined(*chains: tuple[str, ...]) -> tuple[Edge, ...]:
+    def join_chains(*chains: tuple[str, ...]) -> tuple[Edge, ...]:
         numbers = (
             [start + FACE_NAMES.index(name) for name in chain]
             for chain in chains
@@ -99,9 +99,9 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
     # A ring returns to its first landmark.
     rings = [(*ring, ring[0]) for ring in (LIPS, *LIDS)]
     return (
-        ("brows", joined(*BROWS)),
-        ("eyes", joined(*rings[1:])),
-        ("lips", joined(rings[0])),
+        ("brows", join_chains(*BROWS)),
+        ("eyes", join_chains(*rings[1:])),
+        ("lips", join_chains(rings[0])),
     )
 
 
@@ -151,5 +151,5 @@ def face_code(
     if not template.expression:
         return None
     c = constants(template, p.device, p.dtype)
-    found = in_head(p.index_select(1, c.expression), p, head, template)
-    return (found - c.face_rest) / CODE_UNIT
+    offsets = in_head(p.index_select(1, c.expression), p, head, template)
+    return (offsets - c.face_rest) / CODE_UNIT

@@ -131,7 +131,7 @@ def bone_frames(
 def swings(bones: Tensor, parent: Tensor, level: Level) -> Tensor:
     """``[B, M, 3, 3]`` frames relative to ``parent [B, M, 3, 3]`` of a level's ``[B, M, 3]``."""
     # Short bones swing only in part.
-    directions, _ = _shortened(bones)
+    directions, _ = _shorten(bones)
     return level.swing.to((directions.unsqueeze(-2) @ parent).squeeze(-2))
 
 
@@ -150,7 +150,7 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
     # Up is from the middle of the hips to that of the shoulders.
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
-    up = _faded(spine, c.axes[1]).unsqueeze(1)
+    up = _fade(spine, c.axes[1]).unsqueeze(1)
 
     # The left axes of hips and shoulders, orthogonal to the spine.
     lines = torch.stack([l_hip - r_hip, l_sh - r_sh], dim=1)
@@ -160,8 +160,8 @@ def _trunk(q: Tensor, c: Constants) -> Tensor:
     # along it, to the axis that is farthest from the spine's direction.
     farthest = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
     axis = torch.where(up[..., :1].abs() < 0.9, c.axes[0], farthest)
-    other = _faded(lines.flip(1), unit(across(up, axis)))
-    lines = _faded(lines, other)
+    other = _fade(lines.flip(1), unit(across(up, axis)))
+    lines = _fade(lines, other)
     # Once more: a line nearly along the spine keeps the rounding of its long part.
     lines = unit(across(up, lines))
 
@@ -186,9 +186,9 @@ def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants) -> Tensor:
     seen_pair = seen[:, :4].unflatten(1, (2, 2)).all(-1) & seen[:, 4:]
 
     # Their frames: left along the pair, front from its middle to the nose.
-    left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1])
+    left, wide = _shorten(pairs[:, :, 0] - pairs[:, :, 1])
     front = points[:, 4:] - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
-    front, deep = _shortened(across(left, front))
+    front, deep = _shorten(across(left, front))
     frames = torch.stack([left, torch.linalg.cross(front, left), front], dim=-1)
     ears, eyes = frames.unbind(1)
 
@@ -212,7 +212,7 @@ def palms_of(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
     return torch.where(lost, chest, frames)
 
 
-def _faded(v: Tensor, fallback: Tensor) -> Tensor:
+def _fade(v: Tensor, fallback: Tensor) -> Tensor:
     """Unit v; below `MIN_LENGTH` it fades to the unit ``fallback``, which it equals at 0.
 
     No continuous map from the ball to the sphere is the identity on the surface, so one point must
@@ -225,7 +225,7 @@ def _faded(v: Tensor, fallback: Tensor) -> Tensor:
     return unit(torch.where(lost, fallback, v))
 
 
-def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
+def _shorten(v: Tensor) -> tuple[Tensor, Tensor]:
     """v divided by the larger of its length and `MIN_LENGTH`, and the result's squared length."""
     # Clamped as a square: the root of 0 has no gradient.
     length2 = squared_norm(v)

@@ -140,6 +140,6 @@ def zeros_as_missing(points: Float) -> Float:
     return np.where((points == 0).all(-1, keepdims=True), np.nan, points)
 
 
-def known(points: Float) -> Bool:
+def is_known(points: Float) -> Bool:
     """``[...]`` whether all coordinates of ``points [..., D]`` are finite."""
     return np.asarray(np.isfinite(points).all(-1), np.bool_)

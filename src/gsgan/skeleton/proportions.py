@@ -233,17 +233,17 @@ def _hands(p: Float, seen: Bool) -> dict[int, Float]:
 
     A hand that is never seen whole is the other one's mirror image.
     """
-    found = {}
+    hands = {}
     for wrist, hand in HAND_JOINTS.items():
         whole = seen[:, hand].all(1) & seen[:, wrist]
         if whole.any() and p.shape[1] > BODY:
-            found[wrist] = _hand(p[whole, hand], p[whole, wrist])
+            hands[wrist] = _hand(p[whole, hand], p[whole, wrist])
 
     # In the palm's axes, the third coordinate alone tells left from right.
-    if len(found) == 1:
-        (other,) = found.values()
-        found = dict.fromkeys(HAND_JOINTS, other * (1, 1, -1)) | found
-    return found
+    if len(hands) == 1:
+        (other,) = hands.values()
+        hands = dict.fromkeys(HAND_JOINTS, other * (1, 1, -1)) | hands
+    return hands
 
 
 def _hand(p: Float, wrist: Float) -> Float:

@@ -107,9 +107,9 @@ def sanitise(
         return p, valid
 
     # Estimated hips are used, but not marked as seen.
-    placed = valid | _estimated_hips(p, valid, template)
+    placed = valid | _find_hips(p, valid, template)
     _refuse_without_trunk(placed, template)
-    return _filled(p, placed, template, limb_length_sum), valid
+    return _fill(p, placed, template, limb_length_sum), valid
 
 
 def complete_skeleton(
@@ -139,18 +139,16 @@ def complete_skeleton(
     shown = shown.reshape(-1, shown.shape[-1])
 
     # The joints of each template are the first ones of the next larger template.
-    found = p.shape[1]
-    if found != J and {found, J} <= TEMPLATE_SIZES:
-        missing = (0, max(J - found, 0))
+    count = p.shape[1]
+    if count != J and {count, J} <= TEMPLATE_SIZES:
+        missing = (0, max(J - count, 0))
         p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
         shown = pad(shown[:, :J], missing)
     p, valid = sanitise(p, None, template, limb_length_sum)
     return p, valid * shown
 
 
-def _estimated_hips(
-    p: Tensor, valid: Tensor, template: SkeletonTemplate
-) -> Tensor:
+def _find_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
     """``[B, J]`` bool: estimated hips of skeletons that show both shoulders and no hip.
 
     Hips are estimates if they are finite and apart: zeros are none.
@@ -189,7 +187,7 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     )
 
 
-def _filled(
+def _fill(
     p: Tensor,
     valid: Tensor,
     template: SkeletonTemplate,
@@ -245,9 +243,9 @@ def _filled(
             parent = known.index_select(1, level.parents)
             starts = c.starts[level.limbs]
             ends = c.ends[level.limbs]
-            found = q.index_select(1, ends) - q.index_select(1, starts)
+            directions = q.index_select(1, ends) - q.index_select(1, starts)
             known = torch.cat(
-                [known, parent @ swings(found, parent, level)], dim=1
+                [known, parent @ swings(directions, parent, level)], dim=1
             )
     return torch.where(is_seen, p, q + root)
 

@@ -38,7 +38,7 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     if len(p) < 2:
         return
 
-    def seen(v: Tensor, joints: tuple[int, ...]) -> Tensor:
+    def mask_joints(v: Tensor, joints: tuple[int, ...]) -> Tensor:
         return v * valid[:, joints].all(1, keepdim=True)
 
     # The left, as it follows from each foot: shank and foot span the sagittal plane.
@@ -46,7 +46,7 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     for knee, ankle, heel, toes in LEG_JOINTS:
         shank = p[:, knee] - p[:, ankle]
         left = torch.linalg.cross(shank, p[:, toes] - p[:, heel])
-        by_feet = by_feet + seen(left, (knee, ankle, heel, toes))
+        by_feet = by_feet + mask_joints(left, (knee, ankle, heel, toes))
 
     # The left, as it follows from the head: the eyes are above the nose, the ears behind it.
     ears = p[:, SIDE_PAIRS["ears"]].mean(1)
@@ -54,12 +54,14 @@ def refuse_swapped(p: Tensor, valid: Tensor) -> None:
     by_head = torch.linalg.cross(
         eyes - p[:, NOSE_JOINT], p[:, NOSE_JOINT] - ears
     )
-    by_head = seen(
+    by_head = mask_joints(
         by_head, (NOSE_JOINT, *SIDE_PAIRS["ears"], *SIDE_PAIRS["eyes"])
     )
 
     # The lines from right to left that the names of the landmarks state.
-    named = [seen(p[:, a] - p[:, b], (a, b)) for a, b in SIDE_PAIRS.values()]
+    named = [
+        mask_joints(p[:, a] - p[:, b], (a, b)) for a, b in SIDE_PAIRS.values()
+    ]
     lines = normalize(torch.stack(named, dim=1), dim=-1)
 
     # A line that opposes the sum of the others stands apart.

@@ -112,11 +112,11 @@ class SkeletonTemplate:
     @property
     def incoming(self) -> dict[int, int]:
         """Per joint at the end of a bone, the first limb that ends there."""
-        found: dict[int, int] = {}
+        edges: dict[int, int] = {}
         for limb, (_, child) in enumerate(self.limbs):
             if child not in self.torso:
-                found.setdefault(child, limb)
-        return found
+                edges.setdefault(child, limb)
+        return edges
 
     @property
     def limb_length_sum(self) -> float:
@@ -160,7 +160,7 @@ def _unit(x: float, y: float, z: float) -> Vector:
     return (x / norm, y / norm, z / norm)
 
 
-def _mirrored(v: Vector) -> Vector:
+def _mirror(v: Vector) -> Vector:
     return (-v[0], v[1], v[2])
 
 
@@ -277,7 +277,7 @@ def _rest_positions() -> tuple[Vector, ...]:
         if name in _LEFT_REST:
             positions.append(_LEFT_REST[name])
         else:
-            positions.append(_mirrored(_LEFT_REST[_twin(name)]))
+            positions.append(_mirror(_LEFT_REST[_twin(name)]))
     return tuple(positions)
 
 
@@ -311,7 +311,7 @@ def _rest_directions() -> dict[Edge, Vector]:
     left[(29, 31)] = neutral("left_heel", "left_foot_index")
 
     # Each right joint follows its left one.
-    right = {(a + 1, b + 1): _mirrored(v) for (a, b), v in left.items()}
+    right = {(a + 1, b + 1): _mirror(v) for (a, b), v in left.items()}
     return left | right
 
 

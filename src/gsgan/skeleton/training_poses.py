@@ -75,6 +75,6 @@ def training_poses(p: Tensor) -> TrainingPoses:
     rows = (share.sqrt()[:, None] * axes[varied]).tolist()
 
     # The scale is the root mean square of the training poses' own distances.
-    found = TrainingPoses(tuple(mean.tolist()), tuple(map(tuple, rows)), 1.0)
-    typical = float(found.distance(p).square().mean().sqrt())
-    return replace(found, scale=max(typical, NOISE))
+    poses = TrainingPoses(tuple(mean.tolist()), tuple(map(tuple, rows)), 1.0)
+    typical = float(poses.distance(p).square().mean().sqrt())
+    return replace(poses, scale=max(typical, NOISE))

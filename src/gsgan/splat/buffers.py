@@ -53,7 +53,7 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     return tensor if kept is None else tensor.zero_()
 
 
-def kept() -> int:
+def unused_bytes() -> int:
     """Bytes of unused memory that are kept for reuse."""
     return sum(size * len(same) for size, same in list(_free.items()))
 
@@ -74,6 +74,6 @@ def _take(size: int) -> Bytes | None:
 
 def _give_back(memory: Bytes) -> None:
     # All other memory is freed if this would be too much.
-    if kept() + memory.nbytes > MAX_KEPT:
+    if unused_bytes() + memory.nbytes > MAX_KEPT:
         _free.clear()
     _free.setdefault(memory.nbytes, deque()).append(memory)

@@ -155,7 +155,7 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
             _build(command, path)
             loaded = open_library(path)
     except Unavailable as reason:
-        packaged = _packaged()
+        packaged = _load_packaged()
         return packaged, str(reason) if packaged is None else ""
     except OSError as error:
         return None, f"The native kernel cannot be built: {error}."
@@ -164,7 +164,7 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
     return loaded, ""
 
 
-def _packaged() -> ctypes.CDLL | None:
+def _load_packaged() -> ctypes.CDLL | None:
     """The library of the wheel, if there is one and this processor has its instructions."""
     # Those of x86-64-v3, by what torch found.
     plain = torch.backends.cpu.get_cpu_capability() == "DEFAULT"

@@ -118,11 +118,11 @@ def _check_gaussians(gaussians: Gaussians) -> None:
 
 def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """The tensors that are used: with covariances, quats and scales are not."""
-    found = _tensors(gaussians)
+    tensors = _tensors(gaussians)
     if gaussians.covariances is not None:
-        found.pop("Gaussians.quats", None)
-        found.pop("Gaussians.scales", None)
-    return found
+        tensors.pop("Gaussians.quats", None)
+        tensors.pop("Gaussians.scales", None)
+    return tensors
 
 
 @torch.no_grad()

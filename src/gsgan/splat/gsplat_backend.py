@@ -4,7 +4,7 @@ gsplat has its cut-offs compiled in. Their values here are from the sources of g
 on alphas, which differs between versions (0.999 in 1.5.3, 0.99 in later ones), is measured. This
 module was tested against a mock of the package, never on a GPU.
 
-Differences between gsplat and ``Accuracy``, which `given_up` describes:
+Differences between gsplat and ``Accuracy``, which `describe_limits` describes:
 
 - Its cut-offs are those of `COMPILED_IN`, whatever the settings.
 - It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
@@ -52,14 +52,14 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
         return f"gsplat runs on CUDA only, the Gaussians are on {device}."
     if settings.dtype != "float32":
         return f"gsplat computes in float32, the settings {settings.name!r} in {settings.dtype}."
-    return _measured_cap(device)[1]
+    return _measure_cap(device)[1]
 
 
 def differences(settings: Accuracy, device: torch.device) -> list[str]:
     """Differences between gsplat's cut-offs and the settings, one clause each."""
     # Numbers are equal up to rounding, and printed alike.
-    cap, _ = _measured_cap(device)
-    found = []
+    cap, _ = _measure_cap(device)
+    sentences = []
     for name, value in {**COMPILED_IN, "alpha_max": cap or 0.0}.items():
         want = getattr(settings, name)
         if isinstance(value, float):
@@ -68,23 +68,23 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
         else:
             same = want == value
         if not same:
-            found.append(f"{name} is {value}, not {want}")
-    return found
+            sentences.append(f"{name} is {value}, not {want}")
+    return sentences
 
 
-def given_up(settings: Accuracy, device: torch.device) -> str:
+def describe_limits(settings: Accuracy, device: torch.device) -> str:
     """How gsplat's result differs from the settings, in one sentence."""
-    found = [
+    sentences = [
         "it stops pixels one layer earlier",
         *differences(settings, device),
     ]
     return (
         f"Drawing with gsplat, the fastest backend here; differences from the settings "
-        f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
+        f"{settings.name!r}: {'; '.join(sentences)}; backend=torch has none."
     )
 
 
-def unsuited(gaussians: Gaussians, camera: Camera) -> str:
+def why_unsuited(gaussians: Gaussians, camera: Camera) -> str:
     """Why gsplat cannot draw these Gaussians with this camera.
 
     Returns:
@@ -107,8 +107,8 @@ def draw(
 ) -> tuple[Tensor, Tensor]:
     """Projects and blends.
 
-    Conventions are those of ``gsgan.splat.rasterise``; ``why_not`` and ``unsuited`` must be empty
-    for the inputs. The result is differentiable in every tensor of the Gaussians and in the
+    Conventions are those of ``gsgan.splat.rasterise``; ``why_not`` and ``why_unsuited`` must be
+    empty for the inputs. The result is differentiable in every tensor of the Gaussians and in the
     camera's R and t.
 
     Args:
@@ -123,7 +123,7 @@ def draw(
     """
     # gsplat has a dimension of cameras after that of batch items.
     H, W = camera.size
-    means, viewmats = _seen_from_the_camera(gaussians.means, camera)
+    means, viewmats = _to_camera(gaussians.means, camera)
     colours, alphas, _ = importlib.import_module("gsplat").rasterization(
         means=means,
         **_shapes(gaussians),
@@ -168,9 +168,7 @@ def _usable(quats: Tensor) -> Tensor:
     )
 
 
-def _seen_from_the_camera(
-    means: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor]:
+def _to_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Means ``[B, N, 3]`` relative to the camera's centre, and the ``[B, 4, 4]`` view transform.
 
     They are computed in float64, so that a camera far from the origin costs no digits. gsplat has
@@ -196,7 +194,7 @@ def _seen_from_the_camera(
 
 
 @lru_cache(maxsize=8)
-def _measured_cap(device: torch.device) -> tuple[float | None, str]:
+def _measure_cap(device: torch.device) -> tuple[float | None, str]:
     """The alpha of an opaque Gaussian at its centre, or None and the reason."""
     if importlib.util.find_spec("gsplat") is None:
         return None, "gsplat is not installed: pip install 'gsgan[gsplat]'."

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
-from gsgan.utils.tensors import constant, filled
+from gsgan.utils.tensors import constant, fill
 
 # exp(-745.2) is the smallest positive double: beyond this a Gaussian is exactly 0.
 EXP_UNDERFLOW = 746.0
@@ -240,7 +240,7 @@ def field_of_view(
     """
     # Rays through the four corners, as x/z and y/z.
     H, W = size
-    corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
+    corners = fill(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
     # linalg.inv would make the host wait for its check of the result.
     ratios = torch.linalg.inv_ex(K[:, :2, :2]).inverse @ corners
     low = ratios.amin(-1, keepdim=True)
@@ -283,7 +283,7 @@ def _footprint(
     extents = reach.unsqueeze(1) * variances.sqrt()
 
     # The outermost pixel centres are half a pixel inside the image.
-    last = filled(((W - 0.5,), (H - 0.5,)), means)
+    last = fill(((W - 0.5,), (H - 0.5,)), means)
     inside = ((means + extents >= 0.5) & (means - extents <= last)).all(1)
     visible = in_front & inside & (opacities >= settings.alpha_min)
     return torch.where(visible.unsqueeze(-1), extents.mT, 0.0), visible

@@ -62,7 +62,7 @@ def rasterise(
 
     # While torch.export records, drawing is one operator.
     if torch.compiler.is_compiling():
-        return _recorded(gaussians, camera, settings, backend)
+        return _record_operator(gaussians, camera, settings, backend)
     checks.check(gaussians, camera)
     dtype = gaussians.means.dtype
     device = gaussians.means.device
@@ -74,7 +74,7 @@ def rasterise(
     # The backend depends on the device, the settings and the input.
     name, message = resolve_backend(backend, device, settings)
     if name == "gsplat" and (
-        reason := gsplat_backend.unsuited(gaussians, camera)
+        reason := gsplat_backend.why_unsuited(gaussians, camera)
     ):
         name = "torch"
         message = f"Drawing with the torch backend: {reason}"
@@ -136,7 +136,7 @@ def resolve_backend(
     ):
         if why_not := gsplat_backend.why_not(settings, device):
             return "torch", f"Drawing with the torch backend: {why_not}"
-        return "gsplat", gsplat_backend.given_up(settings, device)
+        return "gsplat", gsplat_backend.describe_limits(settings, device)
 
     # The native backend, or torch without its kernel. Other devices always get torch.
     if device.type != "cpu":
@@ -181,7 +181,7 @@ def _draw(
 # -- what torch.export records
 
 
-def _recorded(
+def _record_operator(
     gaussians: Gaussians,
     camera: Camera,
     settings: Accuracy,

@@ -28,7 +28,7 @@ def composite(
     Source: paper Sec. 3.1, ``C = Σ c_i α_i Π_{j<i} (1 - α_j)``.
     """
     # Pixels are independent: chunks of them bound the memory.
-    front_to_back = _sorted(projected)
+    front_to_back = _sort(projected)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
         weights, left = _blend(
@@ -42,15 +42,15 @@ def composite(
     return image[:, : projected.features.shape[-1]], image[:, -1:]
 
 
-def _sorted(projected: Projected) -> Projected:
+def _sort(projected: Projected) -> Projected:
     """The ellipses of each batch item, front to back."""
     # Gaussians of equal depth keep their order.
     order = projected.depths.detach().argsort(dim=1, stable=True)
-    found = {}
+    fields = {}
     for name, x in vars(projected).items():
         index = order if x.ndim == 2 else order.unsqueeze(-1).expand_as(x)
-        found[name] = x.gather(1, index)
-    return Projected(**found)
+        fields[name] = x.gather(1, index)
+    return Projected(**fields)
 
 
 def _pixel_chunks(

@@ -105,7 +105,7 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5
 
 
-def brightened(sh: Tensor, factor: Tensor) -> Tensor:
+def brighten(sh: Tensor, factor: Tensor) -> Tensor:
     """Coefficients ``[B, N, (d+1)², 3]`` of colours that are ``factor [B, N, 1]`` times as bright.
 
     Colours are those of `sh_to_colour`, of which 0.5 is not in the series.

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
-from gsgan.utils.tensors import filled
+from gsgan.utils.tensors import fill
 
 # Bound of the rounding error of q in `_reaches`, in units of the last place.
 ROUNDING = 64
@@ -130,7 +130,7 @@ def _pixel_box(
     """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
     means = projected.means.flatten(0, 1)[rows]
     extents = projected.extents.flatten(0, 1)[rows].to(means)
-    edge = filled((size[1], size[0]), means)
+    edge = fill((size[1], size[0]), means)
 
     # Clamped as floats: footprints may exceed the range of integers. Extents are rounded, so the
     # box is rounded outwards.

@@ -188,7 +188,7 @@ class _Walk:
         # and the remaining layers of such tiles have no weight either way.
         self.stops = settings.transmittance_min > 0 and device.type == "cpu"
 
-        # Sums over pixels of each ellipse, see `_whitened_sums`, and the gradients of its values.
+        # Sums over pixels of each ellipse, see `_sum_whitened`, and the gradients of its values.
         self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)
 
@@ -305,7 +305,7 @@ class _Walk:
             self._add(
                 self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT
             )
-            sums = self._whitened_sums(place, d_alpha.mul_(exponential), u, v)
+            sums = self._sum_whitened(place, d_alpha.mul_(exponential), u, v)
             self._add(self.sums, ids, sums)
 
     def _ids(self, starts: Tensor, counts: Tensor, offset: int) -> Tensor:
@@ -409,7 +409,7 @@ class _Walk:
             torch.mul(layers[:, k - 1], through[:, k - 1], out=layers[:, k])
         return layers, layers[:, -1] * through[:, -1]
 
-    def _whitened_sums(
+    def _sum_whitened(
         self, place: _Place, g: Tensor, u: Tensor, v: Tensor
     ) -> Tensor:
         """``[T, K, 6]`` sums over pixels of ``g`` times 1, u, v, u², u v, v²; overwrites u, v."""

@@ -60,16 +60,16 @@ def with_anchors(c: Character) -> Character:
     """
     # Limbs by their bones, the face by rays.
     main = c.dominant_bones()
-    found: Anchors = {}
+    anchors: Anchors = {}
     for side in SIDES:
-        found |= _limb_anchors(c, main, side)
+        anchors |= _limb_anchors(c, main, side)
     for name, vertex in _Face(c, main).vertices().items():
-        found[name] = -1, vertex
+        anchors[name] = -1, vertex
 
     # Each landmark is a joint or a vertex; the other number is -1.
     body = free_body()
     names = (*body.landmark_names, *body.hand_names, *FACE_NAMES)
-    pairs = np.array([found[name] for name in names], dtype=np.int64)
+    pairs = np.array([anchors[name] for name in names], dtype=np.int64)
     return replace(
         c,
         anchor_names=names,
@@ -81,19 +81,19 @@ def with_anchors(c: Character) -> Character:
 def _limb_anchors(c: Character, main: Ints, side: str) -> Anchors:
     """Joints of arm, hand and leg, and vertices of foot, finger tips and absent fingers."""
     low = side.lower()
-    found = _hand(c, main, side) | _foot(c, main, side)
+    anchors = _hand(c, main, side) | _foot(c, main, side)
     # Without bones, the fingers of the pose landmarks are at the knuckles of the hand landmarks.
     for finger in ("thumb", "index", "pinky"):
-        found[f"{low}_{finger}"] = found[f"{low}_{finger}_mcp"]
+        anchors[f"{low}_{finger}"] = anchors[f"{low}_{finger}_mcp"]
     for name, bone in JOINT_BONES.items():
         if side + bone in c.bones:
-            found[f"{low}_{name}"] = c.bones.index(side + bone), -1
-    return found
+            anchors[f"{low}_{name}"] = c.bones.index(side + bone), -1
+    return anchors
 
 
 def _hand(c: Character, main: Ints, side: str) -> Anchors:
     """Joints of the fingers, tips without a bone, and places on the hand of absent fingers."""
-    found = {}
+    anchors = {}
     at = {bone: k for k, bone in enumerate(c.bones)}
     hand_joint = at[f"{side}Hand"]
 
@@ -116,19 +116,19 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
             last = at.get(f"{side}Hand{finger}{k}", -1)
             tip = np.flatnonzero(main == last)
             if bone is not None:
-                found[name] = bone, -1
+                anchors[name] = bone, -1
             elif last >= 0 and len(tip):
                 # The tip is the outermost vertex of the last bone.
                 outwards = c.joints[last] - c.joints[c.parents[last]]
-                found[name] = (
+                anchors[name] = (
                     -1,
                     int(tip[(c.vertices[tip] @ outwards).argmax()]),
                 )
             else:
                 place = (absent.first + absent.step * k) * along
                 target = wrist + length * (place + absent.thumbwards * ahead)
-                found[name] = _nearest(c, hand, target, hand_joint)
-    return found
+                anchors[name] = _nearest(c, hand, target, hand_joint)
+    return anchors
 
 
 def _foot(c: Character, main: Ints, side: str) -> Anchors:
@@ -255,14 +255,14 @@ class _Face:
     def vertices(self) -> dict[str, int]:
         """Landmark → vertex."""
         x = self.c.vertices
-        found = {}
+        numbers = {}
 
         # The nose is the foremost vertex in the middle below the eyes. Lengths are shares of the
         # distance between the eyes.
         below = (self.mid[2] - x[:, 2]) / self.d
         central = np.abs(x[:, 0] - self.mid[0]) < 0.2 * self.d
         nose = self.skin & central & (below > 0.1) & (below < 1)
-        found["nose"] = int(np.where(nose, x[:, 1], np.inf).argmin())
+        numbers["nose"] = int(np.where(nose, x[:, 1], np.inf).argmin())
 
         # The ears are the outermost places at the height of the nose.
         level = self.skin & (np.abs(below - 0.25) < 0.45)
@@ -271,8 +271,8 @@ class _Face:
         for side, sign, eye in zip(
             ("left", "right"), (1, -1), self.eyes, strict=True
         ):
-            found |= self._eye(side, sign, eye)
-            found |= self._brow(side, sign, eye)
+            numbers |= self._eye(side, sign, eye)
+            numbers |= self._brow(side, sign, eye)
 
             # The vertex nearest to the mean of the outermost ones.
             outwards = np.where(level, sign * x[:, 0], -np.inf)
@@ -280,15 +280,15 @@ class _Face:
 
             # The vertex of skin nearest to the middle of the ear's outer part.
             far = np.linalg.norm(x - ear, axis=1)
-            found[f"{side}_ear"] = int(
+            numbers[f"{side}_ear"] = int(
                 np.where(self.skin, far, np.inf).argmin()
             )
 
         for k, point in enumerate(self._lips()):
-            found[f"mouth_outer_{k}"] = self.at(*point)
-        found["mouth_left"] = found["mouth_outer_0"]
-        found["mouth_right"] = found[f"mouth_outer_{LIP_POINTS // 2}"]
-        return found
+            numbers[f"mouth_outer_{k}"] = self.at(*point)
+        numbers["mouth_left"] = numbers["mouth_outer_0"]
+        numbers["mouth_right"] = numbers[f"mouth_outer_{LIP_POINTS // 2}"]
+        return numbers
 
     def _eye(self, side: str, sign: int, eye: Array) -> dict[str, int]:
         """Landmarks of an eye: the lids bound what is seen of the eyeball."""

@@ -117,7 +117,7 @@ def look_at(
     return SceneCamera(K=K, R=R, t=t, size=(size, size))
 
 
-def zoomed(view: SceneCamera, scale: float) -> SceneCamera:
+def zoom(view: SceneCamera, scale: float) -> SceneCamera:
     """A camera whose focal length is ``scale`` times larger, zoomed about the image's centre."""
     H, W = view.size
     centre = [W / 2, H / 2]

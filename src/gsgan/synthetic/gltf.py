@@ -29,7 +29,7 @@ from gsgan.motion.humanoid import (
     plain_shape,
 )
 from gsgan.motion.rotations import Array, between
-from gsgan.motion.standard import known_joints
+from gsgan.motion.standard import find_joints
 from gsgan.synthetic.anchors import with_anchors
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
@@ -166,23 +166,25 @@ class _Skeleton:
     def _by_other_names(self, names: tuple[str, ...]) -> dict[int, str]:
         """Node number → Mixamo's bone name, by the names that motions have; the bones between the
         hips and the head are spine, up to the arms, and neck."""
-        found = known_joints(names)
-        if not {"Head", "LeftArm", "LeftUpLeg", "RightUpLeg"} <= set(found):
+        joints = find_joints(names)
+        if not {"Head", "LeftArm", "LeftUpLeg", "RightUpLeg"} <= set(joints):
             return {}
         above = self.glb.ancestors
 
         # Hips that are not above the head are not those of the legs.
-        head = above(found["Head"])
-        legs = set(above(found["LeftUpLeg"])) & set(above(found["RightUpLeg"]))
-        if found.get("Hips") not in head:
-            found["Hips"] = next((node for node in head if node in legs), -1)
-        if found["Hips"] < 0:
+        head = above(joints["Head"])
+        legs = set(above(joints["LeftUpLeg"])) & set(
+            above(joints["RightUpLeg"])
+        )
+        if joints.get("Hips") not in head:
+            joints["Hips"] = next((node for node in head if node in legs), -1)
+        if joints["Hips"] < 0:
             return {}
-        named = {node: bone for bone, node in found.items()}
+        named = {node: bone for bone, node in joints.items()}
 
         # Biped's arms hang on its neck, which its name tells.
-        trunk = head[: head.index(found["Hips"])][::-1]
-        above_arm = above(found["LeftArm"])
+        trunk = head[: head.index(joints["Hips"])][::-1]
+        above_arm = above(joints["LeftArm"])
         spine = []
         for node in trunk:
             if node not in above_arm or "neck" in names[node].lower():
@@ -196,7 +198,7 @@ class _Skeleton:
 
         # A bone between the spine and an arm is a collarbone.
         for side in ("Left", "Right"):
-            arm = found.get(f"{side}Arm")
+            arm = joints.get(f"{side}Arm")
             collar = None if arm is None else self.glb.above.get(arm)
             if collar is not None and collar not in named:
                 named[collar] = f"{side}Shoulder"
@@ -266,12 +268,12 @@ def _part(
 
     # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
-    binding = _bound(glb, skeleton, number, attributes, len(position))
+    binding = _bind(glb, skeleton, number, attributes, len(position))
     linear = binding.to_world[:, :3, :3]
     normals = np.zeros_like(position)
     if "NORMAL" in attributes:
         upright = np.linalg.inv(linear).transpose(0, 2, 1)
-        normals = _transformed(upright, glb.accessor(attributes["NORMAL"]))
+        normals = _transform(upright, glb.accessor(attributes["NORMAL"]))
 
     # Corners of the triangles; without indices, every three vertices are one.
     corners = np.arange(len(position))
@@ -289,7 +291,7 @@ def _part(
     uv = np.zeros((len(position), 2))
     if f"TEXCOORD_{uv_set}" in attributes:
         uv = glb.accessor(attributes[f"TEXCOORD_{uv_set}"])
-    uv = _transformed_uv(uv, transform)
+    uv = _transform_uv(uv, transform)
 
     # Colours of vertices multiply the base colour.
     colours = np.ones((len(position), 4))
@@ -302,7 +304,7 @@ def _part(
     part = _Part(
         name=f"{node.name} {mesh.name}",
         material=-1 if primitive.material is None else primitive.material,
-        vertices=_transformed(linear, position) + binding.to_world[:, :3, 3],
+        vertices=_transform(linear, position) + binding.to_world[:, :3, 3],
         normals=normals,
         uv=uv,
         faces=corners[: len(corners) // 3 * 3].reshape(-1, 3),
@@ -310,10 +312,10 @@ def _part(
         bone_weight=binding.weights,
         shapes=_shapes(glb, names, primitive.targets or (), linear),
     )
-    return part if (colours == 1).all() else _painted(glb, part, colours)
+    return part if (colours == 1).all() else _paint(glb, part, colours)
 
 
-def _transformed_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
+def _transform_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
     """Texture coordinates ``[V, 2]`` after KHR_texture_transform: scaled, turned, moved."""
     scaled = uv * transform.get("scale", (1, 1))
     angle = transform.get("rotation", 0.0)
@@ -322,7 +324,7 @@ def _transformed_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
     return turned + transform.get("offset", (0, 0))
 
 
-def _painted(glb: GltfFile, part: _Part, colours: Array) -> _Part:
+def _paint(glb: GltfFile, part: _Part, colours: Array) -> _Part:
     """A part whose colours of vertices ``[V, 4]``, linear, are a texture: 2 x 2 pixels for each
     face, in which colours go on beyond its third corner.
 
@@ -372,7 +374,7 @@ def _painted(glb: GltfFile, part: _Part, colours: Array) -> _Part:
     )
 
 
-def _transformed(matrices: np.ndarray, vectors: Array) -> Array:
+def _transform(matrices: np.ndarray, vectors: Array) -> Array:
     """Vectors ``[V, 3]``, each multiplied by its own matrix ``[V, 3, 3]``."""
     transformed: Array = np.einsum("vij,vj->vi", matrices, vectors)
     return transformed
@@ -388,12 +390,12 @@ def _shapes(
         entry = target if isinstance(target, dict) else vars(target)
         position = entry.get("POSITION")
         if plain in WANTED and position is not None:
-            offsets = _transformed(linear, glb.accessor(position))
+            offsets = _transform(linear, glb.accessor(position))
             shapes[plain] = shapes.get(plain, 0) + offsets
     return shapes
 
 
-def _bound(
+def _bind(
     glb: GltfFile,
     skeleton: _Skeleton,
     number: int,
@@ -478,7 +480,7 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     given = glossy.get("diffuseFactor") or (shader and shader.baseColorFactor)
     factor = np.array(given or (1, 1, 1, 1), np.float64)
     if (factor != 1).any():
-        colour = _scaled(colour, factor)
+        colour = _scale(colour, factor)
     colour = _with_emission(glb, entry, base, colour)
 
     # Only materials that are not opaque are cut out by alpha.
@@ -546,7 +548,7 @@ def _refuse_other_transform(glb: GltfFile, other: Any, base: Any) -> None:
         )
 
 
-def _scaled(colour: Bytes, factor: Array) -> Bytes:
+def _scale(colour: Bytes, factor: Array) -> Bytes:
     """Colours ``[H, W, 4]`` times a factor ``[4]`` that scales linear light and alpha."""
     # New values of all 256 bytes in each channel.
     level = np.arange(256) / 255

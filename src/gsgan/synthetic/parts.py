@@ -104,7 +104,7 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     level = np.abs(centre[:, 2] - cheeks) < 0.05
     front = head & (c.normals[corner, 1] < -0.6) & level
     tone = np.median(lab[front] if front.any() else lab, axis=0)
-    bare = _voted(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
+    bare = _vote(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
     labels = np.where(bare, skin, cloth)
 
     # Between shirt and trousers, the nearer colour decides, if they differ.
@@ -113,12 +113,12 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     if np.linalg.norm(upper - lower) > GARMENT_DISTANCE:
         to_upper = np.linalg.norm(lab - upper, axis=1)
         to_lower = np.linalg.norm(lab - lower, axis=1)
-        garment = np.where(_voted(c, to_upper < to_lower), UPPER, LOWER)
+        garment = np.where(_vote(c, to_upper < to_lower), UPPER, LOWER)
         waist = ~bare & np.isin(bone, _numbers(c, WAIST_BONES))
         labels = np.where(waist, garment, labels)
 
     # Names of materials and meshes take precedence.
-    named = _named(c, names)
+    named = _find_names(c, names)
     right = np.array([name.startswith("Right") for name in c.bones])[bone]
     shoes = np.where(right, RIGHT_SHOE, LEFT_SHOE)
     choices = [named == LEFT_SHOE, named > 0, named < 0]
@@ -168,14 +168,14 @@ def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
     return np.array(cloth), np.array(skin), np.array(roots)
 
 
-def _named(c: Character, names: np.ndarray) -> Ints:
+def _find_names(c: Character, names: np.ndarray) -> Ints:
     """``[F]`` the label in the name of the material, else of the mesh; -1 for skin, 0 for none."""
-    found = np.array([_label_of(surface.name) for surface in c.surfaces])[
+    labels = np.array([_label_of(surface.name) for surface in c.surfaces])[
         c.material
     ]
     distinct, which = np.unique(names, return_inverse=True)
     of_mesh = np.array([_label_of(name) for name in distinct])[which]
-    return np.where(found != 0, found, of_mesh)
+    return np.where(labels != 0, labels, of_mesh)
 
 
 def _label_of(name: str) -> int:
@@ -223,7 +223,7 @@ def _neighbours(c: Character) -> Ints:
     return trimesh.graph.face_adjacency(faces=place.reshape(-1)[c.faces])
 
 
-def _voted(c: Character, flag: np.ndarray, rounds: int = 4) -> np.ndarray:
+def _vote(c: Character, flag: np.ndarray, rounds: int = 4) -> np.ndarray:
     """A flag of faces without its specks: the majority of each face and its neighbours."""
     # A face votes for itself and for its neighbours.
     pairs = _neighbours(c)
@@ -252,7 +252,7 @@ def _hair(
     # Faces with such colours that are connected to the crown.
     to_hair, _ = cKDTree(palette).query(lab)
     to_others, _ = cKDTree(others).query(lab)
-    like = _voted(c, (near & (to_hair < to_others)) | crown, rounds=2) & near
+    like = _vote(c, (near & (to_hair < to_others)) | crown, rounds=2) & near
     pairs = _neighbours(c)
     within = pairs[like[pairs].all(axis=1)]
     parts = connected_component_labels(within, len(like))

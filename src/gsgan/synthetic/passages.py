@@ -18,7 +18,7 @@ def frame_times(frames: int, duration: float) -> NDArray[np.float64]:
     return (np.arange(frames) + 0.5) * duration / frames
 
 
-def held_out(
+def choose_held_out(
     names: Sequence[str], test_frames: int, block: int = 3
 ) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.

@@ -147,7 +147,7 @@ class RecordedMotion:
             ankle += SIGN[side] * self._apart * self._turns["Hips"][:, :, 0]
             ankle[:, 2] += (floor - low).clip(0)
             is_low = low - floor < CONTACT_HEIGHT * leg
-            ankle[:, :2] += _held(ball, is_low, leg, step)
+            ankle[:, :2] += _hold_foot(ball, is_low, leg, step)
             self._ankles.append(ankle)
 
     def _pose(self, turns: dict[str, Array], hips: Array) -> Pose:
@@ -165,7 +165,7 @@ class RecordedMotion:
 
         turns = {}
         for bone, turn in self._turns.items():
-            turns[bone] = _interpolated(turn, self._times, times)
+            turns[bone] = _interpolate(turn, self._times, times)
         pose = self._pose(turns, _between(self._hips, self._times, times))
         ankles = [_between(ankle, self._times, times) for ankle in self._ankles]
 
@@ -192,7 +192,7 @@ class RecordedMotion:
         return pose.motion(shapes, tuple(self._passages[i] for i in index))
 
 
-def _held(
+def _hold_foot(
     ball: Array, low: NDArray[np.bool_], leg: float, step: float
 ) -> Array:
     """``[F, 2]`` shifts that keep a foot in place while it rests, and fade between such times."""
@@ -225,7 +225,7 @@ def _between(values: Array, known: NDArray[Any], times: NDArray[Any]) -> Array:
     return np.stack([np.interp(times, known, x) for x in values.T], axis=1)
 
 
-def _interpolated(turns: Array, known: Array, times: Array) -> Array:
+def _interpolate(turns: Array, known: Array, times: Array) -> Array:
     """``[F, 3, 3]`` rotations known at some times, interpolated along the shortest way."""
     if len(known) == 1:
         return np.repeat(turns, len(times), axis=0)

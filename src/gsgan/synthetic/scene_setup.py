@@ -17,10 +17,10 @@ from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
 from gsgan.motion.readers import RIGS
-from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
+from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoom
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import AVATARS, CHARACTER_FILES, read_character
-from gsgan.synthetic.passages import frame_times, held_out, split_signs
+from gsgan.synthetic.passages import choose_held_out, frame_times, split_signs
 from gsgan.synthetic.recorded_motion import RecordedMotion
 from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.takes import MOTIONS
@@ -67,15 +67,15 @@ def make_tints(strength: float, cameras: int, seed: int) -> list[Tint]:
     leak -= leak.sum(axis=2, keepdims=True) * identity
 
     # The mean over the cameras is the identity.
-    change = _centred(gain)[:, :, None] * identity + CROSSTALK * _centred(leak)
-    shift = MAX_OFFSET * _centred(offset)
+    change = _centre(gain)[:, :, None] * identity + CROSSTALK * _centre(leak)
+    shift = MAX_OFFSET * _centre(offset)
     tints = []
     for matrix, vector in zip(change, shift, strict=True):
         tints.append(Tint(A=identity + strength * matrix, b=strength * vector))
     return tints
 
 
-def _centred(x: Array) -> Array:
+def _centre(x: Array) -> Array:
     """Shifted to mean 0 over the cameras, then scaled to within [-1, 1]."""
     x = x - x.mean(axis=0)
     largest = np.abs(x).max(initial=0)
@@ -303,7 +303,7 @@ class Scene:
                 passages, settings.test_frames
             )
         else:
-            self.test_frames = held_out(passages, settings.test_frames)
+            self.test_frames = choose_held_out(passages, settings.test_frames)
             self.train_frames = [
                 i for i in range(settings.frames) if i not in self.test_frames
             ]
@@ -338,7 +338,7 @@ class Scene:
         # Copies of the test cameras at other scales.
         for name in list(views)[settings.train_cameras :]:
             for scale in settings.test_scale or ():
-                views[f"{name}_x{scale:g}"] = zoomed(views[name], scale)
+                views[f"{name}_x{scale:g}"] = zoom(views[name], scale)
 
         # The lens is the same for all cameras.
         if settings.lens is not None:
@@ -350,7 +350,7 @@ class Scene:
     def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
         """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
         # Without secondary motion, there are no wrinkles.
-        vertices, normals = self._skinned(frame)
+        vertices, normals = self._skin(frame)
         if self.secondary is None:
             return vertices, normals, None
         rotations = self.motion.rotations[frame]
@@ -358,7 +358,7 @@ class Scene:
             float(self.times[frame]), rotations, vertices, normals
         )
 
-    def posed(self, frame: int) -> PosedCharacter:
+    def pose(self, frame: int) -> PosedCharacter:
         """The character at one frame, ready to be rendered."""
         vertices, normals, wrinkles = self.mesh(frame)
         return PosedCharacter(
@@ -379,11 +379,11 @@ class Scene:
 
         points = []
         for frame, joints in enumerate(self.motion.joints):
-            vertices, _ = self._skinned(frame)
+            vertices, _ = self._skin(frame)
             points.append(self.character.landmarks(vertices, joints))
         return self.character.anchor_names, np.stack(points)
 
-    def _skinned(self, frame: int) -> tuple[Array, Array]:
+    def _skin(self, frame: int) -> tuple[Array, Array]:
         """Vertices and normals ``[V, 3]`` by linear blend skinning of the shaped rest pose."""
         character = self.character
         motion = self.motion
@@ -391,7 +391,7 @@ class Scene:
         for name, shape in character.shapes.items():
             if name in motion.shapes:
                 offsets = offsets + motion.shapes[name][frame] * shape
-        return character.skinned(
+        return character.skin(
             motion.rotations[frame], motion.joints[frame], offsets
         )
 
@@ -428,7 +428,7 @@ def extent(
     motion = source.at(frame_times(samples, source.duration))
     points = []
     for rotations, joints in zip(motion.rotations, motion.joints, strict=True):
-        vertices, _ = thinned.skinned(rotations, joints)
+        vertices, _ = thinned.skin(rotations, joints)
         points.append(vertices)
     return np.concatenate(points)
 

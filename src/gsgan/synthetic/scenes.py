@@ -225,7 +225,7 @@ def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
                 continue
 
             # The image in the colours of its camera.
-            person = person or scene.posed(frame)
+            person = person or scene.pose(frame)
             image, alpha, labels = person.render(
                 view, scene.settings.rays_per_pixel
             )

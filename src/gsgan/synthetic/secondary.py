@@ -189,12 +189,12 @@ class Secondary:
         offset = self._loose[:, None] * (self._skin @ sway)
 
         # Cloth hardly sways into the body.
-        outwards = self._welded(normals)
+        outwards = self._merge_duplicates(normals)
         into = np.minimum((offset * outwards).sum(axis=1, keepdims=True), 0)
         offset -= (1 - INWARDS) * into * outwards
 
         # Cloth does not sway below the floor.
-        before = self._welded(vertices)
+        before = self._merge_duplicates(vertices)
         after = before + offset
         floor = np.minimum(before[:, 2], 0)
         after[:, 2] = np.maximum(after[:, 2], floor)
@@ -205,7 +205,7 @@ class Secondary:
         shaded = unit(normals + turned[self._weld])
         return moved, shaded, self._wrinkles(rotations)
 
-    def _welded(self, x: Array) -> Array:
+    def _merge_duplicates(self, x: Array) -> Array:
         """Mean ``[W, 3]`` of the duplicates of each vertex."""
         sums = [np.bincount(self._weld, weights=x[:, i]) for i in range(3)]
         return np.stack(sums, axis=1) / self._count[:, None]
@@ -305,8 +305,8 @@ class Secondary:
         # The springs' transfer functions.
         w = 2 * np.pi * SPRING_FREQUENCY
         spring = [1, 2 * SPRING_DAMPING * w, w * w]
-        inertia = _filtered([-1, 0, 0], spring, place)
-        sway = inertia + _filtered([w * w], spring, hang)
+        inertia = _filter([-1, 0, 0], spring, place)
+        sway = inertia + _filter([w * w], spring, hang)
 
         # The sway is limited smoothly.
         size = np.linalg.norm(sway, axis=-1, keepdims=True)
@@ -388,7 +388,7 @@ class Secondary:
         )
 
 
-def _filtered(
+def _filter(
     numerator: list[float], denominator: list[float], signal: Array
 ) -> Array:
     """Samples ``[T, …]`` after a transfer function in s (bilinear transform), from rest."""

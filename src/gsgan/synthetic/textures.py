@@ -116,22 +116,22 @@ def _pyramid(surface: Surface) -> Iterator[Floats]:
     texels = np.zeros((h, w, 8), np.float32)
     colour = surface.colour.astype(np.float32) / 255
     colour[..., :3] = linear(colour[..., :3])
-    texels[..., :4] = _resized(colour, w, h)
+    texels[..., :4] = _resize(colour, w, h)
     texels[..., 4:7] = FLAT_NORMAL
     if surface.normal is not None:
         normal = surface.normal.astype(np.float32) / 127.5 - 1
-        texels[..., 4:7] = _resized(normal, w, h)
+        texels[..., 4:7] = _resize(normal, w, h)
     yield texels
 
     # OpenCV resizes at most four channels at once.
     while h > 1 or w > 1:
         h = max(1, h // 2)
         w = max(1, w // 2)
-        first = _resized(texels[..., :4], w, h)
-        last = _resized(texels[..., 4:], w, h)
+        first = _resize(texels[..., :4], w, h)
+        last = _resize(texels[..., 4:], w, h)
         texels = np.concatenate([first, last], axis=2)
         yield texels
 
 
-def _resized(texels: Floats, width: int, height: int) -> NDArray[Any]:
+def _resize(texels: Floats, width: int, height: int) -> NDArray[Any]:
     return cv2.resize(texels, (width, height), interpolation=cv2.INTER_AREA)

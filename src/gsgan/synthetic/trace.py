@@ -181,7 +181,7 @@ class Tracer:
             )
         return face, bary
 
-    def blocked(self, origins: Floats, directions: Floats) -> Bools:
+    def is_blocked(self, origins: Floats, directions: Floats) -> Bools:
         """Whether each ray ``[N]`` meets the mesh."""
         if self._solid is not None:
             return self.first(origins, directions)[0] >= 0
@@ -267,7 +267,7 @@ class PosedCharacter:
         character = self.appearance.character
 
         # Pixels are traced in blocks.
-        touched = np.argwhere(self._touched(view))
+        touched = np.argwhere(self._find_touched(view))
         step = max(1, BLOCK_RAYS // rays)
         for first in range(0, len(touched), step):
             y, x = touched[first : first + step].T
@@ -287,7 +287,7 @@ class PosedCharacter:
             labels[y, x] = majority(part, len(character.label_names))
         return image, alpha, labels
 
-    def _touched(self, view: SceneCamera) -> Bools:
+    def _find_touched(self, view: SceneCamera) -> Bools:
         """Pixels ``[H, W]`` that the person may touch: faces' edges and what is between them."""
         H, W = view.size
         # A person who is partly behind the camera may touch every pixel.
@@ -313,7 +313,7 @@ class PosedCharacter:
         origin, directions = pixel_rays(view, x, y, 1)
         directions = view.bend(directions).astype(np.float32)
         start = np.tile(origin.astype(np.float32), (len(directions), 1))
-        touched[y, x] = self.tracer.blocked(start, directions)
+        touched[y, x] = self.tracer.is_blocked(start, directions)
         return touched
 
     def _shoot(
@@ -389,7 +389,7 @@ class PosedCharacter:
         # Only points that face the sun, and that nothing shades.
         k = np.flatnonzero(facing > 0)
         start = lifted[k] + np.float32(SHADOW_OFFSET) * flat[k]
-        k = k[~self.tracer.blocked(start, towards[k])]
+        k = k[~self.tracer.is_blocked(start, towards[k])]
 
         # Blinn-Phong's highlight, about half-way between sun and camera.
         half = _unit(towards[k] - ray[k])
@@ -449,7 +449,7 @@ class PosedCharacter:
 
             # Rays start a little above the surface, which would block them.
             start = X + np.float32(SKY_OFFSET) * np.sign(cosine)[:, None] * N
-            free = ~self.tracer.blocked(start, np.tile(d, (len(X), 1)))
+            free = ~self.tracer.is_blocked(start, np.tile(d, (len(X), 1)))
             possible[rows, inside] += weight
             arrived[rows, inside] += weight * free
         share: Floats = arrived / np.maximum(possible, np.float32(1e-6))

@@ -36,12 +36,12 @@ class StepOneLoss:
     Source: paper Sec. 3.5 (λ = 0.2), without readout, alpha and the perceptual loss.
     """
 
-    l1: float = 0.8
-    ssim: float = 0.2
-    feature_head: float = 0.5
-    alpha: float = 0.1
-    perceptual: float = 0.0
-    perceptual_from: float = 0.3
+    l1: float
+    ssim: float
+    feature_head: float
+    alpha: float
+    perceptual: float
+    perceptual_from: float
 
     def __post_init__(self) -> None:
         at_least("training.step_one.perceptual", self.perceptual, 0)
@@ -170,8 +170,8 @@ class DiscriminatorMaps:
             )
 
         # Through this function the image gets its gradient, and the parameters get none.
-        found = _Through.apply(self.image, (self.copy, list(terms.values())))
-        return dict(zip(terms, found, strict=True))
+        weighted = _Through.apply(self.image, (self.copy, list(terms.values())))
+        return dict(zip(terms, weighted, strict=True))
 
     @property
     def difference(self) -> Tensor:
@@ -217,20 +217,20 @@ class StepTwoLoss:
     """
 
     # Terms of I_pred against the ground truth, by pixel.
-    l1: float = 1.0
-    l2: float = 0.0
-    ssim: float = 0.2
-    alpha: float = 1.0
+    l1: float
+    l2: float
+    ssim: float
+    alpha: float
 
     # Terms of networks: L_perc, L_GAN and L_feat.
-    perceptual: float = 1.0
-    perceptual_every: int = 1
-    adversarial: float = 1.0
-    feature_matching: float = 10.0
-    gan: str = "logistic"
+    perceptual: float
+    perceptual_every: int
+    adversarial: float
+    feature_matching: float
+    gan: str
 
     # The term of Step I's colour, L_Ψ.
-    anchor: float = 1.0
+    anchor: float
 
     def __post_init__(self) -> None:
         one_of("training.step_two.gan", self.gan, FORMS)

@@ -46,10 +46,10 @@ ITERATION_PER_GRADIENT = 1.4
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
-def fitted_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
-    """The schedule with the phases that an avatar has, see `Schedule.fitted`."""
+def fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
+    """The schedule with the phases that an avatar has, see `Schedule.fit_parts`."""
     S = avatar.segmentation
-    return schedule.fitted(
+    return schedule.fit_parts(
         segmentation=S is not None and S.labelled,
         splats=avatar.splats is not None,
         generator=avatar.generator is not None,
@@ -72,7 +72,7 @@ class AvatarTraining(LightningModule):
         avatar: to be trained.
         discriminator: None, or no adversarial weight, leaves the GAN out.
         perceptual: builds L_perc, where the schedule and the weights have it; None leaves it out.
-        schedule: iterations of each phase, see `Schedule.fitted`.
+        schedule: iterations of each phase, see `Schedule.fit_parts`.
         recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
@@ -99,17 +99,17 @@ class AvatarTraining(LightningModule):
         step_one: StepOneLoss,
         step_two: StepTwoLoss,
         *,
-        pose_noise: float = 0.01,
-        window: int | None = None,
-        window_reach: float = 0.2,
-        seed: int = 0,
-        max_skipped: int = 20,
-        skip_window: int = 1000,
-        log_every: int = 20,
-        average: float | None = None,
-        average_every: int = 1,
-        rollback: Rollback | None = None,
-        registration: Registration | None = None,
+        pose_noise: float,
+        window: int | None,
+        window_reach: float,
+        seed: int,
+        max_skipped: int,
+        skip_window: int,
+        log_every: int,
+        average: float | None,
+        average_every: int,
+        rollback: Rollback,
+        registration: Registration,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
         scene: dict[str, Any] | None = None,
@@ -119,7 +119,7 @@ class AvatarTraining(LightningModule):
         # Several optimisers take turns, so the module steps them itself.
         self.automatic_optimization = False
         self.avatar = avatar
-        self.schedule = fitted_schedule(schedule, avatar)
+        self.schedule = fit_schedule(schedule, avatar)
         self.recipes = recipes
 
         # The losses, with the networks that they need.
@@ -145,10 +145,10 @@ class AvatarTraining(LightningModule):
         # Logs, and what happens where training fails.
         self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
-        self.rollback = rollback or Rollback()
+        self.rollback = rollback
 
         # Where the surface of training frames is; known once it is registered.
-        self.registration = registration or Registration()
+        self.registration = registration
         self.registered: Registered | None = None
 
         # Facts that checkpoints store.
@@ -292,14 +292,14 @@ class AvatarTraining(LightningModule):
 
     def _train_segmentation(self, frame: Frame) -> None:
         assert self.avatar.segmentation is not None
-        loss = self._computed(partial(self.avatar.segmentation.loss, frame))
+        loss = self._compute_all(partial(self.avatar.segmentation.loss, frame))
         if loss is not None:
             self._descend({"segmentation/nll": loss}, "segmentation")
 
     def _train_step_one(self, frame: Frame) -> None:
         # Only Step I's colour is rendered; no image is generated.
-        rendering = self._computed(
-            partial(self._rendered, frame, generate=False)
+        rendering = self._compute_all(
+            partial(self._render, frame, generate=False)
         )
         if rendering is None:
             return
@@ -328,8 +328,8 @@ class AvatarTraining(LightningModule):
 
     def _train_step_two(self, frame: Frame) -> None:
         # I_pred is rendered, and judged by the discriminator while the GAN trains.
-        rendering = self._computed(
-            partial(self._rendered, frame, generate=True)
+        rendering = self._compute_all(
+            partial(self._render, frame, generate=True)
         )
         if rendering is None:
             return
@@ -355,7 +355,7 @@ class AvatarTraining(LightningModule):
                 {"step_two/discriminator": maps.loss()}, "discriminator"
             )
 
-    def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
+    def _render(self, frame: Frame, *, generate: bool) -> Rendering:
         # The training's own settings: noise on the pose, and less work where the schedule allows
         # it.
         rendering: Rendering = self.avatar(
@@ -419,11 +419,11 @@ class AvatarTraining(LightningModule):
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
     def _optimisers(self) -> dict[str, Any]:
-        found = self.optimizers()
+        optimisers = self.optimizers()
         return dict(
             zip(
                 self._names,
-                found if isinstance(found, list) else [found],
+                optimisers if isinstance(optimisers, list) else [optimisers],
                 strict=True,
             )
         )
@@ -432,19 +432,19 @@ class AvatarTraining(LightningModule):
         """The optimisers of the parts that make Step I's image."""
         return [name for name in SPLATTING if name in self._names]
 
-    def _computed(self, compute: Callable[[], T]) -> T | None:
+    def _compute_all(self, compute: Callable[[], T]) -> T | None:
         """The result, or None in every process where one cannot compute it: where data or weights
         are not finite, or far away, the rasteriser refuses them with a ValueError."""
         # A failure is kept until all processes know of it.
-        found = None
+        result = None
         problem = ""
         try:
-            found = compute()
+            result = compute()
         except ValueError as error:
             problem = str(error)
 
         # All processes skip the iteration if one of them must.
-        failed = found is None
+        failed = result is None
         if self.processes > 1:
             # A process that skips alone would leave the others waiting.
             flag = torch.tensor(float(failed), device=self.device)
@@ -452,7 +452,7 @@ class AvatarTraining(LightningModule):
 
         # A failed iteration counts as skipped.
         if not failed:
-            return found
+            return result
         self._skip(problem or "another process could not render its images")
         return None
 
@@ -466,7 +466,7 @@ class AvatarTraining(LightningModule):
 
         # The run stops if too many were skipped, else it goes on.
         if stop:
-            raise self._stopped(
+            raise self._stop_error(
                 f"{count} were skipped: {cause}; lower training.recipes.*.rate.peak, or go on with "
                 "a larger training.max_skipped"
             )
@@ -474,7 +474,7 @@ class AvatarTraining(LightningModule):
             f"iteration {self.step}: skipped ({count}, at most {self.skipped.maximum}): {cause}"
         )
 
-    def _stopped(self, why: str) -> GsganError:
+    def _stop_error(self, why: str) -> GsganError:
         """The error that ends a run."""
         return GsganError(
             f"training stopped at iteration {self.step}: {why} (the last good checkpoint is kept)"
@@ -540,7 +540,7 @@ class AvatarTraining(LightningModule):
             wrapped.optimizer for wrapped in self._optimisers().values()
         ]
         if not self.rollback.restore(self, optimisers):
-            raise self._stopped(
+            raise self._stop_error(
                 f"{what}, also after {self.rollback.done} returns to a good state; start again "
                 "with a lower training.recipes.psi.rate.peak"
             )

@@ -26,7 +26,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import spread_frames
 from gsgan.data.texture import grey, texture
 from gsgan.model.avatar import Avatar
-from gsgan.model.body_points import BodyPoints, LearntWeights, moved_normals
+from gsgan.model.body_points import BodyPoints, LearntWeights, move_normals
 from gsgan.model.interpolation import interpolation_matrix
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton.training_poses import pose_in_pelvis
@@ -135,7 +135,7 @@ class Registration:
 
         # The surface of every frame, and what of it the pose explains.
         surface = MovingSurface(avatar, dataset, self)
-        offsets = surface.registered(frames, console)
+        offsets = surface.align_frames(frames, console)
         theta = torch.cat([surface.pose(frame).theta for frame in frames])
         bends = placed.offsets.bends(theta)
         rest, field = linear_fit(bends, offsets)
@@ -159,7 +159,7 @@ def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     inputs = torch.cat([bends, ones], dim=-1).transpose(0, 1).double()
     wanted = offsets.transpose(0, 1).double()
 
-    def fitted(chosen: Tensor, ridge: float) -> Tensor:
+    def fit_columns(chosen: Tensor, ridge: float) -> Tensor:
         x = inputs[:, chosen]
         square = x.mT @ x + ridge * torch.eye(x.shape[-1]).to(x)
         return torch.linalg.solve(square, x.mT @ wanted[:, chosen])
@@ -168,13 +168,13 @@ def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         total = 0.0
         for fold in range(FOLDS):
             left_out = torch.arange(len(offsets)) % FOLDS == fold
-            found = inputs[:, left_out] @ fitted(~left_out, ridge)
-            total += float((wanted[:, left_out] - found).square().sum())
+            residual = inputs[:, left_out] @ fit_columns(~left_out, ridge)
+            total += float((wanted[:, left_out] - residual).square().sum())
         return total
 
     every = torch.ones(len(offsets), dtype=torch.bool)
-    found = fitted(every, min(RIDGES, key=error)).to(offsets)
-    return found[:, -1], found[:, :-1]
+    weights = fit_columns(every, min(RIDGES, key=error)).to(offsets)
+    return weights[:, -1], weights[:, :-1]
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ class MovingSurface:
 
     # -- the chain of frames
 
-    def registered(self, frames: Sequence[int], console: Console) -> Tensor:
+    def align_frames(self, frames: Sequence[int], console: Console) -> Tensor:
         """``[F, C, 3]`` metres at rest: offsets of the controls in each frame."""
         order, before = self._order(frames)
         offsets = np.zeros((len(frames), self.count, 3))
@@ -314,10 +314,10 @@ class MovingSurface:
                     frame = self._frame(frames[i])
                     offsets[i] = mean
                     if textures:
-                        texture = filled(
+                        texture = fill_unknown(
                             textures[before[i]], average(textures.values())
                         )
-                        offsets[i] = self._aligned(
+                        offsets[i] = self._align(
                             frame, offsets[before[i]], mean, texture, pool
                         )
                     textures[i] = self._texture(frame, offsets[i], pool)
@@ -327,9 +327,7 @@ class MovingSurface:
             for i in bars.track(order, description=title):
                 frame = self._frame(frames[i])
                 texture = average(textures.values())
-                offsets[i] = self._aligned(
-                    frame, offsets[i], mean, texture, pool
-                )
+                offsets[i] = self._align(frame, offsets[i], mean, texture, pool)
                 textures[i] = self._texture(frame, offsets[i], pool)
         return torch.from_numpy(offsets).float()
 
@@ -349,7 +347,7 @@ class MovingSurface:
 
     # -- one frame
 
-    def _moved(
+    def _move(
         self, pose: BodyPose, offsets: Matrix
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Means ``[N, 3]``, linear maps ``[N, 3, 3]`` and normals ``[N, 3]`` of the points."""
@@ -357,11 +355,11 @@ class MovingSurface:
         assert pose.bones is not None
         A, t = blend_transforms(pose.bones, *points.weights)
         rest = points.means + torch.from_numpy(self.spread @ offsets).float()
-        normals = moved_normals(A, self.placed.rest_normals)
+        normals = move_normals(A, self.placed.rest_normals)
         return skin(rest, A, t)[0], A[0], normals[0]
 
     @torch.no_grad()
-    def _aligned(
+    def _align(
         self,
         frame: Posed,
         offsets: Matrix,
@@ -373,16 +371,16 @@ class MovingSurface:
         images."""
         per_control = len(self.placed.points) * len(frame.views) / self.count
         for _ in range(ALIGNMENTS):
-            moved = self._moved(frame.pose, offsets)
+            moved = self._move(frame.pose, offsets)
 
             # The normal equations of all views: J δ is the flow.
-            found = pool.map(
+            systems = pool.map(
                 lambda view, moved=moved: self._equations(view, moved, texture),
                 frame.views,
             )
             square = self.regulariser.copy()
             right = -self.regulariser @ (offsets - mean).T.ravel()
-            for part, side in found:
+            for part, side in systems:
                 square += part / per_control
                 right += side / per_control
             change = linalg.solve(square, right, assume_a="pos")
@@ -402,15 +400,15 @@ class MovingSurface:
         flow, trust = flow_between(drawn, view)
 
         # Flow and its trust at the points that the view sees.
-        pixels, facing = seen(view, means, normals, drawn.depth)
-        at = sampled(np.dstack([flow, trust]), pixels)
+        pixels, facing = project_points(view, means, normals, drawn.depth)
+        at = sample_image(np.dstack([flow, trust]), pixels)
         length = np.linalg.norm(at[:, :2], axis=1)
         weight = at[:, 2] * (facing > FACING)
         weight = weight * np.minimum(1, LONG / np.maximum(length, 1e-6))
         chosen = torch.from_numpy(np.flatnonzero(weight > 0.05))
 
         # How pixels move with offsets at rest; pixels per metre make both sides metres.
-        slope = projected_slope(view.camera, means[chosen]) @ A[chosen]
+        slope = projection_slope(view.camera, means[chosen]) @ A[chosen]
         per_metre = slope.norm(dim=(1, 2)).mean().clamp_min(1e-6)
         J = (slope / per_metre).numpy()
         goal = at[chosen, :2] / float(per_metre)
@@ -464,13 +462,13 @@ class MovingSurface:
         self, frame: Posed, offsets: Matrix, pool: ThreadPoolExecutor
     ) -> Texture:
         """The colours of the points in a frame; views that face a point count most."""
-        means, _, normals = self._moved(frame.pose, offsets)
+        means, _, normals = self._move(frame.pose, offsets)
         nothing = Texture(torch.zeros(len(means), 3), torch.ones(len(means)))
 
         def read(view: TrainingView) -> tuple[Float, Float]:
             depth = self._draw(view, means, nothing).depth
-            pixels, facing = seen(view, means, normals, depth)
-            at = sampled(np.dstack([view.image, view.inside]), pixels)
+            pixels, facing = project_points(view, means, normals, depth)
+            at = sample_image(np.dstack([view.image, view.inside]), pixels)
             return at[:, :3], (at[:, 3] > 0.3) * np.maximum(facing, 0) ** 4
 
         # The average over the views.
@@ -492,7 +490,7 @@ def average(textures: Iterable[Texture]) -> Texture:
     return Texture(mean / total.clamp_min(1e-6)[:, None], total)
 
 
-def filled(texture: Texture, other: Texture) -> Texture:
+def fill_unknown(texture: Texture, other: Texture) -> Texture:
     """A texture, and another one where its colours are not known."""
     known = texture.weights > 0.05
     return Texture(
@@ -532,7 +530,7 @@ def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
     return forth, trust * view.inside * drawn.known
 
 
-def seen(
+def project_points(
     view: TrainingView, means: Tensor, normals: Tensor, depth: Float
 ) -> tuple[Float, Float]:
     """Pixels ``[N, 2]`` of points, and the cosine ``[N]`` at which they face the camera; 0 for
@@ -547,17 +545,17 @@ def seen(
     # The drawn depth is that of the nearest surface.
     height, width = depth.shape
     inside = ((at > 0.5) & (at < [width - 0.5, height - 0.5])).all(1)
-    shown = distance < sampled(depth, at) + HIDDEN
+    shown = distance < sample_image(depth, at) + HIDDEN
     return at, facing * (inside & shown)
 
 
-def sampled(image: Float, pixels: Float) -> Float:
+def sample_image(image: Float, pixels: Float) -> Float:
     """``[N, ...]`` an image ``[h, w, ...]`` at pixels ``[N, 2]``, whose centres are at +0.5."""
     # OpenCV remaps images of at most 32,767 columns, and counts from the centre of a pixel.
     rows = np.array_split(
         (pixels - 0.5).astype(np.float32), len(pixels) // 32_000 + 1
     )
-    found = [
+    samples = [
         cv2.remap(
             image,
             part[:, None, 0].copy(),
@@ -567,10 +565,10 @@ def sampled(image: Float, pixels: Float) -> Float:
         )
         for part in rows
     ]
-    return np.concatenate(found)[:, 0]
+    return np.concatenate(samples)[:, 0]
 
 
-def projected_slope(camera: Camera, means: Tensor) -> Tensor:
+def projection_slope(camera: Camera, means: Tensor) -> Tensor:
     """``[N, 2, 3]`` pixels per metre: how points' pixels move with them, without lens
     distortion."""
     x, y, z = camera.to_camera(means.unsqueeze(0))[0].unbind(1)

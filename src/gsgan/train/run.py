@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
-from gsgan.evaluate.origin import trained, training_code
+from gsgan.evaluate.origin import read_method, training_code
 from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.page import refuse_unsuitable
@@ -31,7 +31,7 @@ from gsgan.export.run import export_config
 from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.metrics.lpips import build_lpips
 from gsgan.model.avatar import Avatar
-from gsgan.model.harmonic import Harmonic, distilled
+from gsgan.model.harmonic import Harmonic, distil
 from gsgan.motion.clip import FPS
 from gsgan.run.assemble import (
     build_avatar,
@@ -251,7 +251,7 @@ def build_training(
     with working(console, "measuring the scene"):
         info = data.info
     with working(console, "building the avatar"):
-        avatar = build_avatar(config, info, data.labelled("train"))
+        avatar = build_avatar(config, info, data.select_labelled("train"))
         _store_poses(avatar, data)
     # the same start beside every avatar
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
@@ -302,9 +302,7 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
     frames = data.dataset("train")
     once = {frame: i for i, (_, frame) in enumerate(frames.items)}.values()
     poses = (frames[i].inputs for i in once)
-    fitted = distilled(
-        trained, ((p, seen, body) for p, seen, _, body, _ in poses)
-    )
+    fitted = distil(trained, ((p, seen, body) for p, seen, _, body, _ in poses))
 
     # Other points at rest would need other residuals, so both avatars must have the same.
     state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
@@ -394,7 +392,7 @@ def _evaluate(
     module.to(device)
 
     # Facts about the training are written beside the scores.
-    method = trained(
+    method = read_method(
         folder,
         seed=options.seed,
         iterations=module.step,

@@ -52,7 +52,7 @@ class Schedule:
                 "training.schedule: every phase has 0 iterations; nothing to do"
             )
 
-    def fitted(
+    def fit_parts(
         self,
         *,
         segmentation: bool,

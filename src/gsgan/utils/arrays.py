@@ -37,8 +37,8 @@ def expect_array(
     # Lengths that are given must agree, and so must their number.
     array = arrays[name]
     agrees = array.ndim == len(shape)
-    for due, found in zip(shape, array.shape, strict=False):
-        if due not in (None, found):
+    for due, size in zip(shape, array.shape, strict=False):
+        if due not in (None, size):
             agrees = False
     if not agrees:
         raise DataError(

@@ -296,7 +296,7 @@ def entry(
 
         # Paths that Hydra's grammar cannot read as they are; commas part the values of a sweep.
         sweep = any(option in sys.argv for option in SWEEPS)
-        sys.argv[1:] = [quoted(argument, sweep) for argument in sys.argv[1:]]
+        sys.argv[1:] = [quote(argument, sweep) for argument in sys.argv[1:]]
         command = hydra.main(
             version_base="1.3",
             config_path=str(config_folder()),
@@ -342,7 +342,7 @@ def _end(error: OSError) -> None:
     _print_error(message or f"{error.filename}: {error.strerror}")
 
 
-def quoted(argument: str, sweep: bool = False) -> str:
+def quote(argument: str, sweep: bool = False) -> str:
     """``key=value`` in a form that Hydra's grammar reads as it was typed.
 
     The value of a key of `PATHS`, or each element of a list ``[a,b]`` there, is text: it is put in
@@ -366,7 +366,7 @@ def quoted(argument: str, sweep: bool = False) -> str:
         return f"{key}=[{','.join(_as_text(path) for path in elements)}]"
 
     # Hydra's own grammar reads keys of other kinds, sweeps, and a capture that is given by keys.
-    value = _expanded(value)
+    value = _expand(value)
     read = _read_by_hydra(f"{key}={value}")
     keys = name == "other_capture" and value.startswith("{")
     if read is not None and (
@@ -387,7 +387,7 @@ def _as_text(value: str) -> str:
         return value
 
     # Hydra may read the text as it is; backslashes mean more in a list.
-    value = _expanded(value)
+    value = _expand(value)
     read = _read_by_hydra(f"key={value}")
     same = read is not None and not read.is_sweep_override()
     if same and read.value() == value and "\\" not in value:
@@ -396,17 +396,17 @@ def _as_text(value: str) -> str:
     # The mark is one that the value does not contain, if there is one. Backslashes before a mark
     # would escape it.
     mark = '"' if "'" in value and '"' not in value else "'"
-    value = re.sub(rf"(\\*)({mark}|$)", _escaped, value)
+    value = re.sub(rf"(\\*)({mark}|$)", _escape, value)
     return mark + value + mark
 
 
-def _escaped(match: re.Match[str]) -> str:
+def _escape(match: re.Match[str]) -> str:
     """Backslashes and the quote behind them, or the text's end, for a text in quotes."""
     backslashes, mark = match.groups()
     return 2 * backslashes + (f"\\{mark}" if mark else "")
 
 
-def _expanded(value: str) -> str:
+def _expand(value: str) -> str:
     """The value with the user's folder for a leading ``~/``."""
     return str(Path(value).expanduser()) if value.startswith("~/") else value
 
@@ -447,12 +447,12 @@ def one_sentence(error: BaseException) -> str | None:
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
-    if isinstance(error, ValueError) and _raised_here(error):
+    if isinstance(error, ValueError) and _is_ours(error):
         return str(error)
     return None
 
 
-def _raised_here(error: BaseException) -> bool:
+def _is_ours(error: BaseException) -> bool:
     """Whether a line of gsgan raised the error, about what it was given."""
     # The last entry of a traceback is the line that raised.
     at = error.__traceback__

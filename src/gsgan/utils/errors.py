@@ -17,7 +17,7 @@ class ConfigError(GsganError):
 
 
 @contextmanager
-def explained(cause: str | None) -> Iterator[None]:
+def explain(cause: str | None) -> Iterator[None]:
     """Errors of data inside begin with their cause, if it is known."""
     try:
         yield

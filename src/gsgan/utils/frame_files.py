@@ -55,10 +55,10 @@ class FrameFiles(Mapping[int, str]):
         """The paths of all other frames."""
         # The folder is shared, the arrays are cut.
         keep = np.isin(self.frames, np.fromiter(frames, np.int64), invert=True)
-        found = copy(self)
-        found.frames = self.frames[keep]
-        found._names = self._names[keep]
-        return found
+        kept = copy(self)
+        kept.frames = self.frames[keep]
+        kept._names = self._names[keep]
+        return kept
 
 
 def frame_files(
@@ -83,11 +83,11 @@ def frame_files(
     names = frozenset(entries(place))
     # The index is cached without its folder, so this camera gets a copy with its own.
     try:
-        found = copy(_by_frame(names, suffixes, number))
+        files = copy(_by_frame(names, suffixes, number))
     except DataError as error:
         raise DataError(f"{place}: {error}") from None
-    found.folder = folder
-    return found
+    files.folder = folder
+    return files
 
 
 @lru_cache(maxsize=1)  # cameras mostly have files of the same names
@@ -106,7 +106,7 @@ def _by_frame(
 
     # Every image needs a number of its own, by which it finds its mask.
     number = number or counting(stems.values())
-    found = dict[int, str]()
+    files = dict[int, str]()
     for name, stem in stems.items():
         frame = number(stem)
         if frame is None:
@@ -114,14 +114,14 @@ def _by_frame(
                 f"{name} has no frame number up to {LARGEST_FRAME} in its name; number the "
                 f"frames 0, 1, 2 … equally in all cameras, e.g. 000012{Path(name).suffix}"
             )
-        if frame in found:
+        if frame in files:
             raise DataError(
-                f"{found[frame]} and {name} are both frame {frame} by the last number that differs "
+                f"{files[frame]} and {name} are both frame {frame} by the last number that differs "
                 f"between the names; one number must count the frames, e.g. "
                 f"000012{Path(name).suffix}"
             )
-        found[frame] = name
-    return FrameFiles("", found)
+        files[frame] = name
+    return FrameFiles("", files)
 
 
 def entries(folder: Path) -> list[str]:
@@ -149,7 +149,7 @@ def entries(folder: Path) -> list[str]:
     return names
 
 
-def shifted_numbers(
+def find_shifts(
     images: Iterable[int], others: Mapping[str, Iterable[int]]
 ) -> list[str]:
     """Notes on files whose numbers are those of the images but for their start.
@@ -161,11 +161,11 @@ def shifted_numbers(
     given = sorted(images)
     notes = []
     for what, numbers in others.items():
-        found = sorted(numbers)
-        if len(found) != len(given) or found == given:
+        ordered = sorted(numbers)
+        if len(ordered) != len(given) or ordered == given:
             continue
-        first, other = given[0], found[0]
-        if [frame - first for frame in given] == [n - other for n in found]:
+        first, other = given[0], ordered[0]
+        if [frame - first for frame in given] == [n - other for n in ordered]:
             notes.append(
                 f"doubtful: images are numbered from {first}, {what} from {other}: number both "
                 "alike, or every image gets what belongs to another moment"
@@ -187,16 +187,16 @@ def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
                 place = i
 
     def number(stem: str) -> int | None:
-        found = DIGITS.findall(stem)
-        return frame_of(found[place]) if found else None
+        digits = DIGITS.findall(stem)
+        return frame_of(digits[place]) if digits else None
 
     return number
 
 
 def last_number(stem: str) -> int | None:
     """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
-    found = DIGITS.findall(stem)
-    return frame_of(found[-1]) if found else None
+    digits = DIGITS.findall(stem)
+    return frame_of(digits[-1]) if digits else None
 
 
 def frame_of(digits: str) -> int | None:

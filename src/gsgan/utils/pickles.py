@@ -309,16 +309,16 @@ def read_npz(
             members[info.filename.removesuffix(".npy")] = info
 
         # Sizes are checked before anything is unpacked.
-        found = {}
+        arrays = {}
         for name in members if names is None else members.keys() & set(names):
             size = members[name].file_size
             _expect(
                 size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes"
             )
-            found[name] = _read_array(
+            arrays[name] = _read_array(
                 io.BytesIO(archive.read(members[name])), objects
             )
-        return found
+        return arrays
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:

@@ -79,7 +79,7 @@ def png_bytes(image: Image.Image, marked: bool = True) -> bytes:
     return stream.getvalue()
 
 
-def marked_mp4(video: bytes) -> bytes:
+def mark_mp4(video: bytes) -> bytes:
     """An MP4 file with XMP that marks it as synthetic."""
     # A box: its size, its type, and its content. Readers skip types that they do not know.
     content = MP4_UUID + XMP.encode()
@@ -122,16 +122,16 @@ def _property(xmp: str, name: str) -> str | None:
     # As an attribute `prefix:name="text"`, or as an element `<prefix:name …>text<`.
     attribute = r"""\s*=\s*["']([^"']*)["']"""
     element = r"[^>]*>([^<]*)<"
-    found = re.search(rf"[\w.-]+:{name}(?:{attribute}|{element})", xmp)
-    return (found[1] or found[2]) if found else None
+    match = re.search(rf"[\w.-]+:{name}(?:{attribute}|{element})", xmp)
+    return (match[1] or match[2]) if match else None
 
 
 def _image_xmp(data: bytes) -> str:
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
         # A PNG may have XMP behind the pixels, so these are read first.
         image.load()
-        found = image.info.get(PNG_KEY) or image.info.get("xmp") or ""
-    return found if isinstance(found, str) else found.decode("utf-8", "replace")
+        xmp = image.info.get(PNG_KEY) or image.info.get("xmp") or ""
+    return xmp if isinstance(xmp, str) else xmp.decode("utf-8", "replace")
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:

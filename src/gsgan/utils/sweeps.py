@@ -117,19 +117,19 @@ def _status(command: list[str]) -> int:
 
 
 def _score(path: Path, name: str) -> float:
-    found: Any = json.loads(path.read_text())
+    score: Any = json.loads(path.read_text())
 
     # A name such as novel_pose.full.psnr is a path into nested groups.
     for key in name.split("."):
-        found = found.get(key) if isinstance(found, dict) else None
-    if not isinstance(found, (int, float)):
+        score = score.get(key) if isinstance(score, dict) else None
+    if not isinstance(score, (int, float)):
         raise ConfigError(
             f"objective={name}: {path} has no such score; name split.variant.metric"
         )
-    return float(found)
+    return float(score)
 
 
-def unfinished(folder: Path) -> str | None:
+def why_unfinished(folder: Path) -> str | None:
     """Why the job in a folder is unfinished, or None."""
     # A job without a mark has ended well, or is none of a sweep.
     mark = folder / MARK

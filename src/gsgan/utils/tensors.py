@@ -49,10 +49,10 @@ def squared_norm(v: Tensor) -> Tensor:
     return v.square().sum(-1, keepdim=True)
 
 
-def filled(values: Any, like: Tensor) -> Tensor:
+def fill(values: Any, like: Tensor) -> Tensor:
     """Like `constant` for values that change between calls: filled on the device, not copied."""
     if isinstance(values, tuple | list):
-        return torch.stack([filled(value, like) for value in values])
+        return torch.stack([fill(value, like) for value in values])
     return like.new_full((), values)
 
 
@@ -108,11 +108,11 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, LARGEST)
 
 
-def derived(
+def derive(
     module: nn.Module, name: str, make: Callable[[], Result], *weights: Tensor
 ) -> Result:
     """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
-    ``derived``) it is kept until a weight changes or moves."""
+    ``derive``) it is kept until a weight changes or moves."""
     # While training every call computes anew.
     kept: dict[str, tuple[Any, Result]] | None = getattr(
         module, "derived", None
@@ -122,11 +122,11 @@ def derived(
 
     # A change in place raises the version; a move or a cast changes the address or dtype.
     state = [(x.data_ptr(), x._version, x.dtype) for x in weights]
-    found = kept.get(name)
-    if found is None or found[0] != state:
+    entry = kept.get(name)
+    if entry is None or entry[0] != state:
         with torch.inference_mode(False), torch.no_grad():
-            found = kept[name] = state, make()
-    return found[1]
+            entry = kept[name] = state, make()
+    return entry[1]
 
 
 def farthest_points(points: Tensor, count: int) -> Tensor:

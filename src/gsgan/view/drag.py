@@ -63,7 +63,7 @@ def position(p: Float, name: str) -> Float:
     return p[joint]
 
 
-def dragged(p: Float, name: str, target: Float) -> Float:
+def drag(p: Float, name: str, target: Float) -> Float:
     """The pose with a handle at ``target``, or as near as the bones reach.
 
     Limbs bend by FABRIK from shoulder or hip; hands and feet rotate with the last bone. The head

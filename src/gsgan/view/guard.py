@@ -113,7 +113,7 @@ def _first_name(forwarded: str | None) -> str:
 
 
 @contextmanager
-def guarded(served: str, allowed: str | None = None) -> Iterator[None]:
+def guard_server(served: str, allowed: str | None = None) -> Iterator[None]:
     """A context in which viser starts servers that refuse requests with status 403, see `refusal`.
 
     Args:

@@ -18,9 +18,9 @@ from gsgan.run.drive import (
     REST,
     Drive,
     MotionOptions,
-    distilled_of,
+    distil_run,
     drive_of,
-    smoothed,
+    smooth,
 )
 from gsgan.run.runs import Run
 from gsgan.skeleton.proportions import upright
@@ -28,7 +28,7 @@ from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
-from gsgan.view.guard import guarded
+from gsgan.view.guard import guard_server
 from gsgan.view.session import IDLE_SECONDS, Session, Show
 
 MEGABYTE = 1 << 20
@@ -79,12 +79,12 @@ class Viewer:
         self.run = Run.from_config(config)
         fps = float(above("fps", config.fps))
         if config.distilled:
-            self.run.avatar = distilled_of(options, self.run)
+            self.run.avatar = distil_run(options, self.run)
 
         def read(motion: str) -> Drive:
             chosen = replace(options, motion=motion)
             drive = drive_of(chosen, self.run, fps)
-            return smoothed(config.smooth, drive, fps)
+            return smooth(config.smooth, drive, fps)
 
         # The settings and the first motion of all browsers.
         first = REST if self.run.is_shared else self.run.data.watched[0]
@@ -125,7 +125,10 @@ class Viewer:
         # The server without viser's own banner, and without its share button, which would put the
         # avatar on a public address.
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        with contextlib.redirect_stdout(io.StringIO()), guarded(host, origin):
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            guard_server(host, origin),
+        ):
             self.server = viser.ViserServer(
                 host, port, label="gsgan", verbose=False
             )

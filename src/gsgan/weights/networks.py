@@ -53,18 +53,18 @@ class FeatureNetwork(nn.Module):
         """The maps ``[B, C, h, w]``, from the finest to the coarsest."""
         # Each stage continues from the map of the one before.
         maps = []
-        features = self.normalised(image)
+        features = self.normalise(image)
         for stage in self.stages:
             features = stage(features)
             maps.append(features)
         return maps
 
-    def normalised(self, image: Tensor) -> Tensor:
+    def normalise(self, image: Tensor) -> Tensor:
         """Images with the mean and the deviation that the network was trained with."""
         return (image - self.mean) / self.std
 
 
-def pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
+def load_pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
     """A pretrained network with the five stages that LPIPS compares.
 
     Args:
@@ -136,7 +136,7 @@ class Lpips(nn.Module):
     def __init__(self, net: str, path: str | Path | None = None) -> None:
         super().__init__()
         # One head per layer: the weights of its channels.
-        self.network = pretrained(net, path)
+        self.network = load_pretrained(net, path)
         state = state_of_heads(net)
         for layer in range(len(TAPS[net])):
             self.register_buffer(

@@ -88,7 +88,7 @@ class BackgroundMaps:
         values = _cut(self.maps[stage], rows, columns)
         if not parts:
             return values
-        return _pasted(values, parts[stage], rows[0], columns[0])
+        return _paste(values, parts[stage], rows[0], columns[0])
 
     def _after(self, layer: nn.Module, part: MapPart) -> MapPart:
         """The part of a layer's output, from that of its input."""
@@ -97,10 +97,10 @@ class BackgroundMaps:
 
         # The outputs that read the part, and all that they read; zeros lie around the image.
         before = self.inputs[layer]
-        rows, read_rows = _reached(layer, part.rows, before.shape[-2])
-        columns, read_columns = _reached(layer, part.columns, before.shape[-1])
+        rows, read_rows = _reach(layer, part.rows, before.shape[-2])
+        columns, read_columns = _reach(layer, part.columns, before.shape[-1])
         values = _cut(before, read_rows, read_columns)
-        values = _pasted(values, part, read_rows[0], read_columns[0])
+        values = _paste(values, part, read_rows[0], read_columns[0])
 
         # The padding is in what is read already.
         if isinstance(layer, nn.Conv2d):
@@ -128,7 +128,7 @@ def _number(setting: int | tuple[int, ...] | str) -> int:
     return int(setting[0] if isinstance(setting, tuple) else setting)
 
 
-def _reached(layer: nn.Module, span: Span, length: int) -> tuple[Span, Span]:
+def _reach(layer: nn.Module, span: Span, length: int) -> tuple[Span, Span]:
     """The outputs whose windows read any of a span of ``length`` inputs, and all that they read."""
     assert isinstance(layer, nn.Conv2d | nn.MaxPool2d)
     kernel = _number(layer.kernel_size)
@@ -163,7 +163,7 @@ def _cut(values: Tensor, rows: Span, columns: Span) -> Tensor:
     return functional.pad(inside, beyond) if any(beyond) else inside
 
 
-def _pasted(values: Tensor, part: MapPart, top: int, left: int) -> Tensor:
+def _paste(values: Tensor, part: MapPart, top: int, left: int) -> Tensor:
     """Values that begin at row ``top`` and column ``left`` of a map, with a part of it in place."""
     first_row = part.rows[0] - top
     first_column = part.columns[0] - left

@@ -15,7 +15,7 @@ from gsgan.body import (
     forward_kinematics,
     skin,
 )
-from gsgan.model.body_points import moved_normals
+from gsgan.model.body_points import move_normals
 from gsgan.scene import Gaussians
 from gsgan.splat import Accuracy
 from stability.cases.case import REFUSED, Case, Inputs, Tolerance
@@ -101,7 +101,7 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
         "means": skin(inputs["points"], A, t),
         "covariances": axes @ axes.mT,
     }
-    return {**posed, "normals": moved_normals(A, up)}
+    return {**posed, "normals": move_normals(A, up)}
 
 
 def _rendered(

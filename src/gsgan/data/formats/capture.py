@@ -102,9 +102,9 @@ class CaptureReader:
         """
         # The folder, its files, then the checks that all formats share.
         folder = dataset_folder(root, "cameras.json, images/ and masks/")
-        found = _find(folder, limits, smpl, self)
+        layout = _find(folder, limits, smpl, self)
         hint = "check that cameras, landmarks and masks belong together"
-        return finish(found, limits, self.consistency, hint, self.drop_frames)
+        return finish(layout, limits, self.consistency, hint, self.drop_frames)
 
 
 def read_capture(
@@ -365,23 +365,23 @@ def _index_images(
         )
 
     # Hidden folders, such as those that file managers make, do not count.
-    found = set()
+    folders = set()
     for name in entries(folder):
         if (folder / name).is_dir() and not name.startswith("."):
-            found.add(name)
+            folders.add(name)
 
     # A folder and a camera without each other are most likely misspelt.
-    unknown = sorted(found - set(cameras))
+    unknown = sorted(folders - set(cameras))
     if unknown:
         raise DataError(
             f"{folder} has the camera {unknown[0]}, which {root / 'cameras.json'} does not list; "
             f"it lists {', '.join(cameras)}"
         )
     for name in cameras:
-        if name not in found:
+        if name not in folders:
             raise DataError(
                 f"{root / 'cameras.json'} lists the camera {name}, but {folder / name} "
-                f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
+                f"does not exist; there are {', '.join(sorted(folders)) or 'none'}"
             )
 
     # A camera without images is most likely a mistake too.

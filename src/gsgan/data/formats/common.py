@@ -68,9 +68,9 @@ class FolderReader:
             max_missing_masks=self.max_missing_masks,
             header_stride=20,
         )
-        found = self.find(folder, limits, smpl)
+        layout = self.find(folder, limits, smpl)
         return finish(
-            found, limits, self.consistency, self.hint, self.drop_frames
+            layout, limits, self.consistency, self.hint, self.drop_frames
         )
 
     def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:

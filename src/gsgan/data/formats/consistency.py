@@ -74,7 +74,7 @@ def check_consistency(
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             masks.append(layout.mask_path(name, frame))
             empty = empty and not mask.any()
-            joints = layout.landmarks.seen(frame)
+            joints = layout.landmarks.visible_joints(frame)
 
             # NaN if no joint is in view.
             share = inside_share(mask, camera, joints, limits.joint_tolerance)
@@ -84,7 +84,7 @@ def check_consistency(
         return
 
     # A camera in another unit.
-    person = np.median(layout.landmarks.seen(frames[0]), axis=0)
+    person = np.median(layout.landmarks.visible_joints(frames[0]), axis=0)
     metres = camera_distances(layout.cameras, person)
     far = far_cameras(metres, limits.far_camera)
     if far:

@@ -195,7 +195,7 @@ def _masks(
     root: Path, names: Sequence[str], person: int
 ) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
     """The masks by camera and frame; only those of the person if their names hold an id."""
-    found = {}
+    masks = {}
     for name in names:
         # Keys hold the frame and the person.
         files = frame_files(
@@ -207,8 +207,8 @@ def _masks(
             frame, number = divmod(key, PEOPLE)
             if number in (0, person + 1):
                 own[frame] = (mask_file(path),)
-        found[name] = own
-    return found
+        masks[name] = own
+    return masks
 
 
 def _camera_folders(root: Path, contents: str) -> list[str]:

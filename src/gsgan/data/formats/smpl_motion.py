@@ -190,11 +190,11 @@ def _parameter(
     # Files nest the numbers differently.
     values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
-        found = str(len(values))
+        shape = str(len(values))
         if len(values) == 87:
-            found += " (SMPL-X with 6 numbers for each hand, which this reader does not know)"
+            shape += " (SMPL-X with 6 numbers for each hand, which this reader does not know)"
         raise DataError(
-            f"{where}: '{key}' must hold {expected} numbers, found {found}"
+            f"{where}: '{key}' must hold {expected} numbers, found {shape}"
         )
     if not np.isfinite(values).all():
         raise DataError(

@@ -199,15 +199,15 @@ def _index(
 ) -> Files:
     """The files by camera and frame; each camera must have some."""
     # Folders are named by camera.
-    found = {}
+    index = {}
     for name in cameras:
         folder = place.format(camera=name)
-        found[name] = frame_files(root, folder, IMAGES)
-        if not found[name]:
+        index[name] = frame_files(root, folder, IMAGES)
+        if not index[name]:
             raise DataError(
                 f"{root / folder} holds no {kind}; expected 00000000.jpg and so on"
             )
-    return found
+    return index
 
 
 def _leave_out(images: Files, path: Path, notes: list[str]) -> None:
@@ -241,7 +241,7 @@ def read_missing(
         DataError: on a line that names no image of a camera.
     """
     # One image per line; empty lines do not count.
-    found = set()
+    missing = set()
     lines = read_text(path, errors="replace").splitlines()
     for number, raw in enumerate(lines, 1):
         line = raw.strip()
@@ -262,8 +262,8 @@ def read_missing(
                 f"{path}, line {number}: expected an image such as "
                 f"{next(iter(cameras))}/00000012.jpg, found {line[:80]!r}"
             )
-        found.add((camera, frame))
-    return found
+        missing.add((camera, frame))
+    return missing
 
 
 def read_motion(

@@ -224,9 +224,9 @@ def read_annots(root: Path) -> Annots:
     counts = {key: len(getattr(annots, key)) for key in "KRTD"}
     counts["image folders"] = len(folders)
     if len(set(counts.values())) != 1 or not folders:
-        found = ", ".join(f"{count} {key}" for key, count in counts.items())
+        listing = ", ".join(f"{count} {key}" for key, count in counts.items())
         raise DataError(
-            f"{path} must hold one K, R, T, D and image folder per camera, found {found}"
+            f"{path} must hold one K, R, T, D and image folder per camera, found {listing}"
         )
     return annots
 

@@ -131,7 +131,7 @@ export class Gaussians {
     return this.h.bound ? this.h.bound * Math.tanh(x) : this.h.height * x;
   }
 
-  /** Adds the stretch of the surface to A, up to its limit: gsgan.body.lbs.stretched. */
+  /** Adds the stretch of the surface to A, up to its limit: gsgan.body.lbs.stretch_jacobian. */
   private stretch(i: number, A: Float64Array, bones: ArrayLike<number>): void {
     const { rest, slope, slopeBone, pulled } = this, n = this.h.slopes;
     pulled.fill(0);

@@ -65,7 +65,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
     # The landmarks of each image, and its mask as a file.
-    found: dict[str, list[Any]] = {}
+    results: dict[str, list[Any]] = {}
     detector = Detector(options)
     follower = Follower(options.person) if options.person else None
     for done, (frame, image) in enumerate(images, start=1):
@@ -75,14 +75,14 @@ def main() -> None:
         if follower is not None:
             follower.follow(landmarks["px"], landmarks["conf"])
         for name, value in (*landmarks.items(), ("frame_id", frame)):
-            found.setdefault(name, []).append(value)
+            results.setdefault(name, []).append(value)
         if (
             folder
             and (mask := detector.mask(image, landmarks["px"])) is not None
         ):
             cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
-    if not found:
+    if not results:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
 
     # The results appear at once, when they are complete.
@@ -90,7 +90,7 @@ def main() -> None:
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
         arrays: dict[str, Any] = {
-            name: np.array(values) for name, values in found.items()
+            name: np.array(values) for name, values in results.items()
         }
         np.savez(stream, **arrays)
     part.replace(out)
@@ -190,14 +190,14 @@ class Detector:
     def landmarks(self, image: Any) -> dict[str, Any]:
         # MediaPipe reads RGB; parts that it did not find are None.
         rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        found = self.body.process(rgb)
+        result = self.body.process(rgb)
         size = image.shape[1], image.shape[0]
-        pose = found.pose_landmarks
+        pose = result.pose_landmarks
         visibility = (
             [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
         )
         hands = {
-            side: getattr(found, f"{side}_hand_landmarks", None)
+            side: getattr(result, f"{side}_hand_landmarks", None)
             for side in ("left", "right")
         }
 
@@ -205,14 +205,14 @@ class Detector:
         return {
             "px": pixels(pose, size, JOINTS),
             "conf": np.array(visibility, np.float32),
-            "world": space(found.pose_world_landmarks),
+            "world": space(result.pose_world_landmarks),
             "faces": len(self.faces.process(rgb).detections or ()),
             **{side: pixels(hand, size, HAND) for side, hand in hands.items()},
             **{
                 f"{side}_z": depth(hand, size, HAND)
                 for side, hand in hands.items()
             },
-            "face": pixels(getattr(found, "face_landmarks", None), size, FACE),
+            "face": pixels(getattr(result, "face_landmarks", None), size, FACE),
         }
 
     def mask(self, image: Any, px: Any) -> Any:

@@ -5,7 +5,12 @@ from collections.abc import Sequence
 import torch
 
 from gsgan.metrics.image import psnr
-from gsgan.report.figures.layout import Drawing, Panel, draw_panels, written
+from gsgan.report.figures.layout import (
+    Drawing,
+    Panel,
+    draw_panels,
+    format_number,
+)
 from gsgan.report.figures.subjects import (
     Numbers,
     Shot,
@@ -54,18 +59,20 @@ def details(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
         numbers[shot.name] = {}
         for subject in subjects:
             image = subject.image(shot)
-            found = measure(image, shot.truth)
+            scores = measure(image, shot.truth)
             rows[subject.name].append(
-                Panel(image, written(found["psnr"], 2, " dB"))
+                Panel(image, format_number(scores["psnr"], 2, " dB"))
             )
 
             # The details beside the image, with their own score.
             for name, box in boxes.items():
                 part = image[..., *box]
                 score = finite(psnr(part, shot.truth[..., *box]))
-                found[f"psnr_{name.replace(' ', '_')}"] = score
-                rows[subject.name].append(Panel(part, written(score, 2, " dB")))
-            numbers[shot.name][subject.name] = found
+                scores[f"psnr_{name.replace(' ', '_')}"] = score
+                rows[subject.name].append(
+                    Panel(part, format_number(score, 2, " dB"))
+                )
+            numbers[shot.name][subject.name] = scores
 
     # One title per column, one name per row.
     figure, _ = draw_panels(

@@ -100,6 +100,6 @@ def draw_panels(
     return figure, axes
 
 
-def written(value: float | None, digits: int, unit: str = "") -> str:
+def format_number(value: float | None, digits: int, unit: str = "") -> str:
     """A number with its unit, or n/a."""
     return "n/a" if value is None else f"{value:.{digits}f}{unit}"

@@ -24,7 +24,7 @@ from gsgan.report.figures.layout import (
     Drawing,
     Panel,
     draw_panels,
-    written,
+    format_number,
 )
 from gsgan.report.figures.subjects import (
     Numbers,
@@ -50,7 +50,7 @@ Images = list[dict[str, Tensor]]  # per shot, by name
 
 def strip(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """One camera over time: a row for the ground truth and one per run, PSNR below each image."""
-    images, numbers = _measured(subjects, shots)
+    images, numbers = _measure(subjects, shots)
 
     # The first row is the truth, each other row a run.
     panels = [[Panel(shot.truth) for shot in shots]]
@@ -76,7 +76,7 @@ def comparison(
     run.
     """
     # A row per shot: the truth, then every run with its scores.
-    images, numbers = _measured(subjects, shots)
+    images, numbers = _measure(subjects, shots)
     panels: list[list[Panel]] = []
     boxes = []
     for shot, held in zip(shots, images, strict=True):
@@ -88,14 +88,16 @@ def comparison(
         above = [Panel(shot.truth)]
         below = [Panel(true_detail)]
         for name, image in held.items():
-            found = numbers[shot.name][name]
-            note = f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"
+            value = numbers[shot.name][name]
+            note = (
+                f"{_decibels(value)}\nF1 {format_number(value['edge_f1'], 3)}"
+            )
             above.append(Panel(image, note))
             if detail:
                 magnified = image[..., *box]
                 score = finite(psnr(magnified, true_detail))
-                found["psnr_detail"] = score
-                below.append(Panel(magnified, written(score, 2, " dB")))
+                value["psnr_detail"] = score
+                below.append(Panel(magnified, format_number(score, 2, " dB")))
         panels.append(above)
         if detail:
             panels.append(below)
@@ -142,7 +144,7 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     return slice(top, top + height), slice(left, left + width)
 
 
-def _measured(
+def _measure(
     subjects: Sequence[Subject], shots: Sequence[Shot]
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
     """Images of each shot by run, and their scores."""
@@ -160,7 +162,7 @@ def _measured(
 
 
 def _decibels(found: Numbers) -> str:
-    return written(found["psnr"], 2, " dB")
+    return format_number(found["psnr"], 2, " dB")
 
 
 NUMBERS_FILE = "figures.json"
@@ -234,10 +236,10 @@ def make_figures(config: DictConfig) -> None:
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
 
     # The numbers and captions are of all figures together.
-    found: set[str] = set()
+    files: set[str] = set()
     for subject in subjects:
-        found.update(subject.marks)
-    marks = sorted(found)
+        files.update(subject.marks)
+    marks = sorted(files)
     _write_record(out, made, subjects, marks)
     lines = [f"marked: {mark}" for mark in marks]
     lines.append(

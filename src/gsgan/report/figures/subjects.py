@@ -217,17 +217,17 @@ def _open(
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
     run = read_run(folder, scored=False)
-    found = run.data | {"fingerprint": fingerprint(data)}
+    facts = run.data | {"fingerprint": fingerprint(data)}
 
     # The figures' data may differ from those of the scores.
-    run = replace(run, seed=config.seed, data=found)
+    run = replace(run, seed=config.seed, data=facts)
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
         name = NAME
 
     # A figure of an unfinished run says so.
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
-    total = run.planned(segmentation=avatar.segmentation is not None)
+    total = run.plan_length(segmentation=avatar.segmentation is not None)
     if step < total:
         marks = [
             *marks,
