@@ -98,7 +98,7 @@ def test_advice_where_the_generator_gains_little(
     data, module = build_training(tiny(f"model={model}", *words))
     console = Console(record=True, width=200)
     device = torch.device("cpu")
-    describe(console, tmp_path, data, module, device, "32-true")
+    describe(console, tmp_path, data, module, device, "32-true", None)
     text = console.export_text()
     assert ("Gaussians per pixel of the person" in text) == advised
     assert ("model=splat_only trains it alone" in text) == advised
