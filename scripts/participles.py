@@ -31,7 +31,7 @@ def is_participle(name: str) -> bool:
 def main() -> None:
     """Lists the functions by file, then their number and share."""
     count = 0
-    found: list[str] = []
+    participles: list[str] = []
     for path in sorted(
         Path(sys.argv[1] if sys.argv[1:] else "src").rglob("*.py")
     ):
@@ -43,9 +43,11 @@ def main() -> None:
                 continue
             count += 1
             if is_participle(node.name):
-                found.append(f"{path}:{node.lineno} {node.name}")
-    print("\n".join(found))
-    print(f"{len(found)} of {count} functions, {len(found) / count:.1%}")
+                participles.append(f"{path}:{node.lineno} {node.name}")
+    print("\n".join(participles))
+    print(
+        f"{len(participles)} of {count} functions, {len(participles) / count:.1%}"
+    )
 
 
 if __name__ == "__main__":

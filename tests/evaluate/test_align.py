@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsgan.evaluate.align import PoseAlignment
+from gsgan.evaluate.align import align_poses
 from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
 
@@ -27,7 +27,7 @@ def test_a_turned_arm_is_found_again(tiny):
         bone = avatar.solver.joint_names.index(f"upperarm01.{side}")
         turned[:, bone, 2] += 0.14
     start = replace(true, theta=turned, transl=true.transl + 0.02)
-    aligned = PoseAlignment(steps=40)(avatar, replace(shown, body=start), None)
+    aligned = align_poses(avatar, replace(shown, body=start), None)
 
     # Landmarks come back to less than half of their distance.
     def away(pose):
@@ -40,4 +40,4 @@ def test_a_turned_arm_is_found_again(tiny):
 def test_an_avatar_without_a_body_is_refused(tiny):
     data, module = build_training(tiny("model=image_to_image"))
     with pytest.raises(ConfigError, match="align=pose"):
-        PoseAlignment()(module.avatar, data.dataset("train")[0], None)
+        align_poses(module.avatar, data.dataset("train")[0], None)

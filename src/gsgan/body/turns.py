@@ -8,8 +8,6 @@ from torch import Tensor
 
 from gsgan.scene import BodyPose
 
-# metres of the root's move for each radian of a joint's turn
-METRES_PER_RADIAN = 0.375
 # joints that are too small in an image to be found there
 SMALL_JOINTS = ("finger", "toe")
 
@@ -25,7 +23,7 @@ def turn_scale(joint_names: Sequence[str], transl: float) -> Tensor:
     return scale
 
 
-def turned(pose: BodyPose, moves: Tensor) -> BodyPose:
+def turn_joints(pose: BodyPose, moves: Tensor) -> BodyPose:
     """B poses changed by ``[B, bones + 1, 3]``: radians of each joint, and metres of the root."""
     theta = pose.theta + moves[:, :-1]
     transl = pose.transl + moves[:, -1]

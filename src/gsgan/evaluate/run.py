@@ -21,7 +21,6 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import VALIDATION, Item, spread_items
-from gsgan.evaluate.align import PoseAlignment
 from gsgan.evaluate.distance import write_distances
 from gsgan.evaluate.files import (
     FACTS_FILE,
@@ -193,9 +192,8 @@ def evaluate_folder(
     if config.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
-    align = None
-    if config.align is not None:
-        align = PoseAlignment()
+    align = config.align is not None
+    if align:
         out = out / "aligned"
         marks = [*marks, ALIGNED]
     if len(set(config.splits)) < len(HELD_OUT_SPLITS):

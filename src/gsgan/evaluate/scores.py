@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
-from gsgan.evaluate.align import PoseAlignment
+from gsgan.evaluate.align import align_poses
 from gsgan.evaluate.grids import grid_rows
 from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.metrics.image import (
@@ -255,7 +255,7 @@ def painter(
     *,
     solve: bool = False,
     colours: bool = True,
-    align: PoseAlignment | None = None,
+    align: bool = False,
 ) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full`` and, where a generator painted
     it, Step I's colour as ``splat``, each with its own alpha.
@@ -264,7 +264,7 @@ def painter(
         avatar: to evaluate.
         solve: solve every body pose from the skeleton, in place of the data's.
         colours: correct for the cameras' colours; False if they are not the training cameras.
-        align: the body poses on the images that are scored.
+        align: align each body pose with its image first, see `align_poses`.
     """
 
     def predict(frame: Frame, item: Item) -> Prediction:
@@ -272,8 +272,9 @@ def painter(
         if solve:
             frame = replace(frame, body=None)
         camera_index = frame.camera_index if colours else None
-        if align is not None:
-            frame = replace(frame, body=align(avatar, frame, camera_index))
+        if align:
+            body = align_poses(avatar, frame, camera_index)
+            frame = replace(frame, body=body)
         *inputs, _ = frame.inputs
         with torch.no_grad():
             painting = avatar(*inputs, camera_index)

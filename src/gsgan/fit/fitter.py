@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms, skin
 from gsgan.body.skinned import carry, vertex_normals
-from gsgan.body.turns import turn_scale, turned
+from gsgan.body.turns import turn_joints, turn_scale
 from gsgan.fit.frames import MaskedFrames, Silhouette, around
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.scene import BodyPose, Camera, Gaussians
@@ -221,7 +221,7 @@ class Fitter:
         rows = rows.to(self.start.theta.device)
         move = self.moves(rows).view(len(rows), -1, 3) * self.scale
         start = BodyPose(self.start.theta[rows], self.start.transl[rows])
-        return turned(start, move)
+        return turn_joints(start, move)
 
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""

@@ -214,6 +214,11 @@ class AvatarTraining(LightningModule):
         self.seconds_before = self.train_seconds
         self._began = None
 
+    @property
+    def _reach(self) -> float | None:
+        """Metres beyond a random part of the window at which Ψ is still computed; None: all."""
+        return None if self.window is None else self.window_reach
+
     # -- one iteration
 
     def expected_hours(self, frame: Frame) -> float:
@@ -234,7 +239,7 @@ class AvatarTraining(LightningModule):
             for _ in range(2):
                 began = time.perf_counter()
                 rendering = self.avatar(
-                    *frame.inputs, generate=generate, reach=self.window_reach
+                    *frame.inputs, generate=generate, reach=self._reach
                 )
                 image = rendering.image if generate else rendering.colour
                 image.square().mean().backward()
@@ -363,7 +368,7 @@ class AvatarTraining(LightningModule):
             pose_noise=self._pose_noise(frame.skeleton),
             generate=generate,
             supersample=self.schedule.fine(self.step),
-            reach=None if self.window is None else self.window_reach,
+            reach=self._reach,
         )
 
         # The rollback watches the person's alpha and colours.
@@ -410,9 +415,7 @@ class AvatarTraining(LightningModule):
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         # The names tell which of Lightning's list each optimiser is.
         groups = parameter_groups(
-            self.avatar,
-            self.feature_head,
-            self.discriminator,
+            self.avatar, self.feature_head, self.discriminator
         )
         check_recipes(self.recipes, groups)
         self._names = list(groups)
