@@ -38,11 +38,10 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     error = numbers["error_px"]
     assert error["plain"] > 12
     assert error["plain"] > error["robust"] > error["flips"] > error["refined"]
-    assert error["smoothed"] < 6
+    assert error["body"] < 6
     assert (
         max(
-            camera["error_px"]["smoothed"]
-            for camera in numbers["cameras"].values()
+            camera["error_px"]["body"] for camera in numbers["cameras"].values()
         )
         < 9
     )

@@ -14,10 +14,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsgan.data.skeletons import hips_below
 from gsgan.prepare.body_problem import OUTLIER, BodyProblem, Normal, State
 from gsgan.scene import NEAR
-from gsgan.skeleton import sanitise
+from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.joints import BODY
+from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.arrays import evenly_spaced
 
 KEYFRAMES = 40  # maximum number of frames that determine the shape
@@ -29,8 +31,8 @@ SHARED = 12
 # A cut: joints move (median) by this many times the usual step, and by this many metres.
 CUT_RATIO = 4.0
 MIN_CUT = 0.15
+MIN_SEEN = 0.05  # share of the frames: a joint that fewer show is not inferred in the others
 CUT_SECONDS = 10.0  # longer than any gap that a motion passes
-MIN_TRUNK = 2  # of shoulders and hips: a frame with fewer has no start
 
 
 @dataclass(frozen=True)
@@ -60,15 +62,19 @@ def solve_views(views: Views) -> Tensor:
     """The landmarks ``[F, 33, 3]`` of the body in each frame.
 
     Keyframes determine the shape; then the frames are solved together, in parts. Frames that show
-    too little of a trunk are NaN.
+    too little of a trunk are NaN, and so are joints that hardly any frame shows.
     """
-    # The motion does not go on over a cut; frames that the poses can start from.
+    # The motion does not go on over a cut. People filmed from the waist up start with hips below
+    # their shoulders; rows are the frames that the poses can start from.
     views = replace(views, time=with_cuts(views.p, views.time))
     seen = views.p.isfinite().all(-1)
-    trunk = seen[:, [11, 12, 23, 24]].sum(1)
-    shoulders = seen[:, [11, 12]].all(1)
-    rows = ((trunk > MIN_TRUNK) | shoulders).nonzero().flatten()
+    begun = torch.from_numpy(hips_below(views.p.numpy(), seen.numpy()))
+    views = replace(views, p=begun)
+    trunk = begun.isfinite().all(-1)[:, list(MEDIAPIPE33.torso)].sum(1)
+    rows = (trunk >= MIN_TRUNK_JOINTS).nonzero().flatten()
     p = torch.full_like(views.p, torch.nan)
+    if not len(rows):
+        return p
 
     # The shape, which starts as a usual one.
     keys = rows[evenly_spaced(len(rows), KEYFRAMES, ends=True)]
@@ -79,12 +85,15 @@ def solve_views(views: Views) -> Tensor:
     for first in range(0, max(len(rows) - SHARED, 1), PART - SHARED):
         at = rows[first : first + PART]
         whole = ViewsProblem(views[at], shape=False, smooth=True)
-        begun = replace(whole.start(), shared=state.shared)
-        found, _ = whole.minimise(begun, POSE_STEPS)
+        start = replace(whole.start(), shared=state.shared)
+        found, _ = whole.minimise(start, POSE_STEPS)
         X = whole.landmarks(found, whole.solver(found.shared))
         new = p[at].isnan().all(-1).all(-1)
         new |= torch.arange(len(at)) >= SHARED // 2
         p[at[new]] = X[new]
+
+    # Nothing says where the legs of a person are whose legs are in no image.
+    p[:, seen.double().mean(0) < MIN_SEEN] = torch.nan
     return p
 
 

@@ -56,8 +56,12 @@ MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
 BETTER = 0.9
 # Pixels: silhouettes, which are of whole pixels, do not judge cameras by which they agree so well.
 PIXELATION = 0.5
+# Landmarks are biased, so they may fit better cameras worse; but in no camera by this factor: then
+# silhouettes are cut off, or of something else. An error of a thousandth of the focal length is
+# usual.
+CONTRADICTED = 1.5
+USUAL_ERROR = 1.0
 INFERRED = 0.1  # confidence of a joint that no two cameras see, but a body has
-SHOULDERS = [11, 12]
 
 
 def match_hands(
@@ -233,10 +237,12 @@ def solve(
 
     # A body in smooth motion, from the views of all cameras.
     seen = is_known(p)
-    if settings.body and seen[:, SHOULDERS].all(1).any():
-        smoothed[:, :BODY] = body_joints(
+    if settings.body:
+        of_body = body_joints(
             cameras, corrected.uv, corrected.weight, p, time, settings.noise
         )
+        if is_known(of_body).any():
+            smoothed[:, :BODY] = of_body
     p = smoothed
     conf_seen = _mean_seen(corrected.weight, corrected.weight)
     inferred = np.where(is_known(p), INFERRED, 0.0)
@@ -249,8 +255,8 @@ def solve(
     # Errors by stage are those of the body, in pixels of each camera.
     stages_in_pixels = {}
     for name, values in stages.items():
-        of_body = values.reshape(conf.shape)[:, :, :BODY]
-        stages_in_pixels[name] = of_body * to_pixels
+        body_error = values.reshape(conf.shape)[:, :, :BODY]
+        stages_in_pixels[name] = body_error * to_pixels
 
     # Clocks by the cameras that silhouettes have chosen: wrong ones look like late clocks.
     chosen = CameraArray(given.K, cameras.R, cameras.t)
@@ -279,7 +285,8 @@ class Refined(NamedTuple):
     """Cameras after the refinement, and what silhouettes say of them."""
 
     cameras: CameraArray
-    # median distance of silhouettes from epipolar lines, pixels: given cameras, refined ones
+    # median distance of silhouettes from epipolar lines, pixels: given cameras, refined ones, NaN
+    # where landmarks contradict these
     frontier: tuple[float, float]
 
 
@@ -313,20 +320,33 @@ def refine(
     if settings.refinements == 0 or few or error <= PIXELATION:
         return Refined(given, (error, error))
 
-    # The best of the refined cameras, by the frames between.
+    # The best of the refined cameras, by the frames between. Landmarks must not contradict them.
     best = given
-    lowest = np.inf
+    lowest = np.nan
+    limit = CONTRADICTED * np.maximum(
+        _landmark_errors(given, found), USUAL_ERROR
+    )
     for weight in LANDMARK_WEIGHTS:
         cameras = _refine_cameras(
             given, found, fitted, some[::2], weight, settings
         )
+        if (_landmark_errors(cameras, found) > limit).any():
+            continue
         after = float(np.nanmedian(frontier_points(cameras, judging).error))
-        if after < lowest:
+        if not after >= lowest:
             best = cameras
             lowest = after
     if lowest > BETTER * error:
         best = given
     return Refined(best, (error, lowest))
+
+
+def _landmark_errors(cameras: CameraArray, found: Corrected) -> Float:
+    """The median error ``[C]`` of the body's landmarks, thousandths of the focal length."""
+    uv = _flat(found.uv[:, :, :BODY])
+    unit, _ = cameras.normalise(uv)
+    points = robust(unit, uv, _flat(found.weight[:, :, :BODY]))
+    return nanmedian(points.error, -1)
 
 
 def _refine_cameras(
