@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 
 from gsgan.utils.config import (
     DATA_PATHS,
+    PATH_LISTS,
     PATHS,
     config_folder,
     paths_as_text,
@@ -69,6 +70,11 @@ def test_a_list_of_odd_paths_arrives_as_typed():
     paths = [path for path in ODD if "," not in path and "'" not in path]
     found = parsed(f"motion=[{', '.join(paths)},'with,comma']")
     assert [str(path) for path in found] == [*paths, "with,comma"]
+
+
+@pytest.mark.parametrize("key", sorted(PATHS - PATH_LISTS))
+def test_brackets_are_part_of_a_path_that_stands_alone(key):
+    assert parsed(f"{key}=[final]") == "[final]"
 
 
 def test_commas_part_the_values_of_a_sweep():

@@ -92,6 +92,9 @@ PATHS = frozenset(
     }
 )
 
+# Of these, the keys that may hold a list; elsewhere [final] is the name of a folder.
+PATH_LISTS = frozenset({"compare", "motion", "runs"})
+
 
 def config_folder() -> Path:
     """conf/: inside the package when installed, beside src/ in a checkout.
@@ -345,7 +348,7 @@ def _end(error: OSError) -> None:
 def quote(argument: str, sweep: bool = False) -> str:
     """``key=value`` in a form that Hydra's grammar reads as it was typed.
 
-    The value of a key of `PATHS`, or each element of a list ``[a,b]`` there, is text: it is put in
+    The value of a key of `PATHS`, or each element of a list ``[a,b]`` of `PATH_LISTS`, is text: it is put in
     quotes if Hydra would read something else, such as a number. Other values are put in quotes
     where Hydra could not read them at all. A shell does not expand ``~/`` there, so it is expanded
     here.
@@ -361,7 +364,8 @@ def quote(argument: str, sweep: bool = False) -> str:
     name = key.lstrip("+")
 
     # A list of paths, each of them as typed.
-    if name in PATHS and value.startswith("[") and value.endswith("]"):
+    listed = value.startswith("[") and value.endswith("]")
+    if name in PATH_LISTS and listed:
         elements = ELEMENT.findall(value[1:-1])
         return f"{key}=[{','.join(_as_text(path) for path in elements)}]"
 
