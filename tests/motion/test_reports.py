@@ -182,6 +182,26 @@ def test_joints_of_common_exporters_are_known(names):
     assert known == {f"Left{bone}": place for place, bone in enumerate(LIMB)}
 
 
+LIMBS_OF = {
+    "l_hip l_knee l_ankle l_toe l_shoulder l_elbow l_wrist": "my_rig_{}",
+    "L_Thigh L_Calf L_Foot L_Toe0 L_UpperArm L_Forearm L_Hand": "ValveBiped.Bip01_{}",
+    "LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftArm LeftForeArm LeftHand": "Robot_{}",
+    "thigh.L shin.L foot.L toe.L upper_arm.L forearm.L hand.L": "ORG-{}",
+    "left_upLeg left_leg left_foot left_toes left_arm left_forearm left_hand": "{}_joint",
+    "l_upleg l_leg l_foot l_toebase l_arm l_forearm l_hand": "{}_JNT",
+    "HipLeft KneeLeft AnkleLeft ToeLeft ShoulderLeft ElbowLeft WristLeft": "m{}",
+    "thigh_stretch.l leg_stretch.l foot.l toes_01.l arm_stretch.l forearm_stretch.l hand.l": "{}",
+}
+
+
+@pytest.mark.parametrize("words", LIMBS_OF, ids=LIMBS_OF.get)
+def test_words_that_all_joints_share_are_no_part_of_their_names(words):
+    trunk = [f"spine{k}" for k in range(6)]
+    names = map(LIMBS_OF[words].format, [*words.split(), *trunk])
+    known = find_joints(tuple(names))
+    assert known == {f"Left{bone}": place for place, bone in enumerate(LIMB)}
+
+
 def test_daz_fingers_and_twists():
     known = find_joints(
         ("lMid1", "lMid2", "lPinky1", "lThumb1", "lForearmTwist", "lThighTwist")

@@ -1,6 +1,7 @@
 """Bone and face shape names of common rigs, as those of Mixamo and a canonical set of shapes."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import Any
@@ -32,10 +33,16 @@ HUMANOID_BONES = (
     *_on_both_sides(SIDE_BONES),
     *_on_both_sides(FINGER_BONE_NAMES),
 )
-# The number that ends a name, and the share of names with a number of their own in files of
-# Sketchfab.
+# The number that ends a name: files of Sketchfab give one of its own to each.
 NUMBER = re.compile(r"_\d+$")
-SKETCHFAB_SHARE = 0.6
+# The first and the last word of a name of several words, and the share of names from which a word
+# is no part of the bones' names: Robot_Hips, hips_joint.
+FIRST_WORD = re.compile(r"^([^\W_]+)[\W_]+(?=[^\W_])")
+LAST_WORD = re.compile(r"(?<=[^\W_])[\W_]+([^\W_]+)$")
+SHARED = 0.6
+WHOLE = 12  # names of a whole rig, and not of a hand
+# Words that tell which rig or side it is.
+TELLING = re.compile(r"l|r|left|right|j|bip\d*|cc|def", re.IGNORECASE)
 # Mixamo's names by their lower-case form.
 CANONICAL = {bone.lower(): bone for bone in HUMANOID_BONES}
 
@@ -89,12 +96,25 @@ def vrm_bone(name: str, version: int) -> str | None:
 
 
 def plain_names(names: Iterable[str | None]) -> list[str]:
-    """Names without the numbers that Sketchfab adds to those of all joints."""
-    given = [name or "" for name in names]
-    numbers = {match[0] for match in map(NUMBER.search, given) if match}
-    if len(numbers) <= SKETCHFAB_SHARE * sum(map(bool, given)):
-        return given
-    return [NUMBER.sub("", name) for name in given]
+    """Names without the numbers and the words that programs add to those of all joints."""
+    plain = [name or "" for name in names]
+    enough = SHARED * sum(map(bool, plain))
+    numbers = {match[0] for match in map(NUMBER.search, plain) if match}
+    if len(numbers) > enough:
+        plain = [NUMBER.sub("", name) for name in plain]
+
+    # Word by word, from both ends.
+    for pattern in (FIRST_WORD, LAST_WORD):
+        while len(plain) >= WHOLE:
+            words = [match and match[1] for match in map(pattern.search, plain)]
+            ((word, count),) = Counter(words).most_common(1)
+            if word is None or count <= enough or TELLING.fullmatch(word):
+                break
+            plain = [
+                pattern.sub("", name) if own == word else name
+                for name, own in zip(plain, words, strict=True)
+            ]
+    return plain
 
 
 def mixamo_bone(name: str) -> str | None:

@@ -54,17 +54,17 @@ DRIFT_SECONDS = 0.5
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
-    "UpLeg": "upleg upperleg thigh thighbend hip femur",
-    "Leg": "leg loleg lowleg lowerleg shin calf knee tibia",
+    "UpLeg": "upleg upperleg thigh thighbend hip femur thighstretch",
+    "Leg": "leg loleg lowleg lowerleg shin calf knee tibia legstretch",
     "Foot": "ankle foot",
     "ToeBase": "toebase toe toes ball",
-    "Arm": "arm uparm uarm upperarm humerus shldr shldrbend shoulder",
-    "ForeArm": "forearm forearmbend farm lowarm loarm lowerarm elbow radius",
+    "Arm": "arm uparm uarm upperarm humerus shldr shldrbend armstretch shoulder",
+    "ForeArm": "forearm forearmbend farm lowarm loarm lowerarm elbow radius forearmstretch",
     "Hand": "wrist hand",
     "Head": "head",
 }
 # Rigify numbers the bones of the trunk, from the hips to the head; separators do not count.
-RIGIFY = {"DEFspine": "Hips", "DEFspine006": "Head"}
+RIGIFY = {"DEFspine": "Hips", "DEFspine006": "Head", "spine006": "Head"}
 # Regular expressions of the fingers' names.
 FINGER_ALIASES = {
     "Thumb": "thumb",
@@ -80,8 +80,9 @@ PHALANX_NUMBERS = {
     "intermediate": 2,
     "distal": 3,
 }
-# Words that mean a side.
+# Words that mean a side, and neither.
 SIDE_WORDS = {"l": "Left", "r": "Right", "left": "Left", "right": "Right"}
+MIDDLE_WORDS = ("c", "m", "x")
 
 
 def find_joints(names: tuple[str, ...]) -> dict[str, int]:
@@ -117,7 +118,7 @@ def _bone(name: str) -> tuple[str, int]:
     for word in map(str.lower, words):
         if word in SIDE_WORDS and side in ("", word):
             side = word
-        else:
+        elif word not in MIDDLE_WORDS:
             stem += word
 
     # The side may be a prefix of the stem itself, as in "lthigh".

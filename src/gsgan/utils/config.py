@@ -348,10 +348,10 @@ def _end(error: OSError) -> None:
 def quote(argument: str, sweep: bool = False) -> str:
     """``key=value`` in a form that Hydra's grammar reads as it was typed.
 
-    The value of a key of `PATHS`, or each element of a list ``[a,b]`` of `PATH_LISTS`, is text: it is put in
-    quotes if Hydra would read something else, such as a number. Other values are put in quotes
-    where Hydra could not read them at all. A shell does not expand ``~/`` there, so it is expanded
-    here.
+    The value of a key of `PATHS`, or each element of a list ``[a,b]`` of `PATH_LISTS`, is text: it
+    is put in quotes if Hydra would read something else, such as a number. Other values are put in
+    quotes where Hydra could not read them at all. A shell does not expand ``~/`` there, so it is
+    expanded here.
 
     Args:
         argument: of the command line.
