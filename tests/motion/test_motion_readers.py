@@ -508,7 +508,8 @@ def test_an_amc_without_its_skeleton(tmp_path, proportions):
 
 def test_other_files(tmp_path, proportions):
     for name, content, message in (
-        ("a.fbx", b"x", r"a\.fbx.*\.npz"),
+        ("a.fbx", b"x", r"a\.fbx.*FBX2glTF"),
+        ("a.csv", b"x", r"a\.csv.*\.npz"),
         ("a.npz", b"", r"07_01\.amc|a\.npz"),
         ("b.npz", b"PK not a zip", r"b\.npz"),
     ):
@@ -979,6 +980,30 @@ def test_relatives_of_smpl_are_the_same_motion(tmp_path, shared, proportions):
     np.testing.assert_allclose(directions(found), directions(truth), atol=1e-6)
     with pytest.raises(ConfigError, match="is a folder; give the file in it"):
         standard(tmp_path / "amass.npz", proportions, smpl=tmp_path)
+
+
+@pytest.mark.parametrize("door", ["null frame", "named", "npz"])
+def test_image_landmarks_are_refused_at_every_door(tmp_path, proportions, door):
+    shares = np.random.default_rng(0).uniform(0.4, 0.6, (5, 33, 3))
+    shares[:, [23, 24], 2] = 0
+    path = tmp_path / "image.json"
+    frames = shares.tolist()
+    if door == "npz":
+        path = tmp_path / "image.npz"
+        np.savez(path, pose_world_landmarks=shares)
+    elif door == "named":
+        named = [{"pose_world_landmarks": frame} for frame in frames]
+        path.write_text(json.dumps(named))
+    else:
+        path.write_text(json.dumps([None, *frames]))
+    with pytest.raises(DataError, match="not its image landmarks"):
+        read_motion(path, Source(proportions))
+
+
+def test_arrays_without_a_unit_say_what_to_do(tmp_path, proportions):
+    np.save(tmp_path / "freemocap.npy", np.ones((4, 33, 3)))
+    with pytest.raises(DataError, match=r"numpy\.savez.*'p'"):
+        read_motion(tmp_path / "freemocap.npy", Source(proportions))
 
 
 def test_bare_lists_of_shares_of_an_image_are_refused(tmp_path, proportions):

@@ -322,6 +322,27 @@ def test_markers_with_a_prefix_and_files_without_units(
     assert clip.fps == 25
 
 
+@pytest.mark.parametrize("unit", ["meters", "M"])
+def test_units_are_known_by_their_words(tmp_path, landmarks, proportions, unit):
+    path = write_trc(tmp_path / "m.trc", landmarks)
+    path.write_text(path.read_text().replace("\tm\n", f"\t{unit}\n"))
+    clip = read_motion(path, Source(proportions))
+    np.testing.assert_allclose(clip.p[:, 23], landmarks[:, 23], atol=1e-9)
+
+
+def test_markers_of_half_a_trunk_and_columns_without_tabs_are_named(
+    tmp_path, landmarks, proportions
+):
+    path = write_trc(tmp_path / "m.trc", landmarks)
+    text = path.read_text()
+    path.write_text(text.replace("Shoulder", "_shoulder_study"))
+    with pytest.raises(DataError, match="L_shoulder_study"):
+        read_motion(path, Source(proportions))
+    path.write_text(text.replace("\t", "  "))
+    with pytest.raises(DataError, match="separated by tabs"):
+        read_motion(path, Source(proportions))
+
+
 def test_markers_without_a_trunk_are_named(tmp_path, landmarks, proportions):
     path = write_trc(tmp_path / "m.trc", landmarks)
     path.write_text(

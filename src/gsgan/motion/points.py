@@ -19,8 +19,15 @@ from gsgan.utils.frame_files import frame_files
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
-# Metres in a unit that a file may name.
+# Metres in a unit that a file may name, and other names of units, in lower case.
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+UNIT_NAMES = {
+    "meters": "m",
+    "metres": "m",
+    "centimeters": "cm",
+    "millimeters": "mm",
+    "millimetres": "mm",
+}
 LEFT_RIGHT_SHOULDER = [11, 12]
 LEFT_RIGHT_HIP = [23, 24]
 TRUNK_LENGTH = 0.5  # metres from shoulder to hip
@@ -71,7 +78,10 @@ def read_points3d(path: Path) -> Points3D:
     points = (
         _read_c3d(path) if path.suffix.lower() == ".c3d" else _read_trc(path)
     )
-    if points.unit is not None and points.unit not in UNITS:
+    unit = points.unit
+    if unit is not None:
+        unit = UNIT_NAMES.get(unit.lower(), unit.lower())
+    if unit is not None and unit not in UNITS:
         raise DataError(
             f"{path}: Units is {points.unit!r}; expected one of {', '.join(UNITS)}"
         )
@@ -85,12 +95,13 @@ def read_points3d(path: Path) -> Points3D:
 
     # Some programs write zeros for markers that were not seen.
     p = zeros_as_missing(p)
-    if not np.isfinite(p[:, LEFT_RIGHT_SHOULDER + LEFT_RIGHT_HIP]).any():
+    pairs = (LEFT_RIGHT_SHOULDER, LEFT_RIGHT_HIP)
+    if not all(np.isfinite(p[:, pair]).any() for pair in pairs):
         raise DataError(
             f"{path} has no shoulders and hips; expected joints such as LShoulder and LHip, found "
             f"{', '.join(points.names)}"
         )
-    p *= _metres(p) if points.unit is None else UNITS[points.unit]
+    p *= _metres(p) if unit is None else UNITS[unit]
     order = np.argsort(points.frames)
     p = p[order]
 
@@ -108,6 +119,8 @@ def _read_trc(path: Path) -> Markers:
     try:
         lines = read_text(path, errors="replace").splitlines()
         header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
+        if "\t" not in lines[3]:
+            raise ValueError("its columns are not separated by tabs")
         markers = [name for name in lines[3].split("\t")[2:] if name]
 
         # Frame, time and the coordinates.

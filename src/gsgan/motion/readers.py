@@ -152,6 +152,10 @@ def read_motion(path: Path, source: Source) -> Clip:
     reader = READERS.get(path.suffix.lower())
     if path.is_dir():
         reader = read_fits
+    if path.suffix.lower() == ".fbx":
+        raise DataError(
+            f"{path}: .fbx is not read; convert it to .glb with FBX2glTF or Blender"
+        )
     if reader is None:
         raise DataError(
             f"{path} has an unknown format; expected one of {', '.join(READERS)}"
@@ -192,6 +196,11 @@ def read_dictionary(path: Path, source: Source) -> Clip:
     """A pickled dictionary of arrays, as of AIST++ (.pkl) or a frame of ZJU-MoCap (.npy)."""
     read = read_npy if path.suffix.lower() == ".npy" else read_pickle
     content = read(path)
+    if isinstance(content, np.ndarray) and content.shape[1:] == (BODY, 3):
+        raise DataError(
+            f"{path} holds landmarks without their unit: save them in metres by numpy.savez, as "
+            "the array 'p' of an .npz file"
+        )
     if not isinstance(content, dict):
         raise DataError(
             f"{path} holds no dictionary; expected one of arrays, such as 'poses'"
@@ -301,6 +310,7 @@ def _by_names(
     world = _first(arrays, WORLD_KEYS)
     if world is not None:
         p = _with_visibility(path, world, arrays.get("visibility"))
+        _refuse_image_landmarks(path, p, named=True)
         return Clip(
             path=path,
             p=p[..., :3],
@@ -676,18 +686,10 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
         rows.append(_landmark_row(f"{path}, frame {i}", frame))
     p = np.stack(rows)
 
-    # Lists without a name may be image landmarks, of which the depth alone is relative to the hips.
+    # Landmarks without a name may be those of the image.
     named = isinstance(content, dict) and bool(content.keys() & set(WORLD_KEYS))
-    if not named and all(isinstance(frame, list) for frame in frames):
-        middle = np.nan_to_num(nanmedian(p[:, HIPS, :3].mean(1), axis=0))
-        aside = np.linalg.norm(middle[:2]) > MAX_FROM_HIPS
-        flat = p[..., :2][np.isfinite(p[..., :2])]
-        shares = np.mean((flat >= 0) & (flat <= 1)) > SHARES
-        if aside and (shares or abs(middle[2]) < HIPS_DEPTH):
-            raise DataError(
-                f"{path}: the middle of the hips is at {middle.round(2).tolist()}; expected "
-                "MediaPipe's world landmarks, in metres from there, not its image landmarks"
-            )
+    named = named or any(isinstance(frame, dict) for frame in frames)
+    _refuse_image_landmarks(path, p, named)
     return Clip(
         path=path,
         p=p[..., :3],
@@ -696,6 +698,25 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
         up=None,
         unit="metres",
     )
+
+
+def _refuse_image_landmarks(path: Path, p: Float, named: bool) -> None:
+    """Refuses landmarks ``[F, 33, 3+]`` of the image, of which the depth alone is relative to the
+    hips; ``named`` ones must be shares of an image too.
+
+    Raises:
+        DataError: when they are not relative to the hips.
+    """
+    middle = np.nan_to_num(nanmedian(p[:, HIPS, :3].mean(1), axis=0))
+    aside = np.linalg.norm(middle[:2]) > MAX_FROM_HIPS
+    flat = p[..., :2][np.isfinite(p[..., :2])]
+    shares = ((flat >= 0) & (flat <= 1)).sum() > SHARES * flat.size
+    level = abs(middle[2]) < HIPS_DEPTH
+    if aside and ((shares and level) if named else (shares or level)):
+        raise DataError(
+            f"{path}: the middle of the hips is at {middle.round(2).tolist()}; expected "
+            "MediaPipe's world landmarks, in metres from there, not its image landmarks"
+        )
 
 
 def _landmark_row(where: str, frame: Any) -> Float:
