@@ -386,6 +386,8 @@ def scene_of(folder: Path, names: str, moments: int = 2) -> Path:
         "{moment}/{camera}.jpg",
         "{moment}/{camera}/image.jpg",
         "{camera}/{moment}.png",
+        "images/frame_{moment}_{camera}.png",
+        "images/{camera}_{moment}.jpg",
     ],
 )
 def test_the_part_of_the_path_that_differs_names_the_camera(tmp_path, names):
@@ -406,6 +408,71 @@ def test_an_angle_of_view_alone_has_the_size_of_the_images(tmp_path):
         fitted.K, [[1000, 0, 540], [0, 1000, 960], [0, 0, 1]]
     )
     assert note is None
+
+
+def test_pairs_of_near_cameras_in_one_folder_stay_apart(tmp_path):
+    path = scene_of(tmp_path, "images/{camera}_{moment}.png")
+    for eye in ("left", "right"):
+        path.write_text(
+            path.read_text().replace(f"_00000{'lr'.index(eye[0])}", f"_{eye}")
+        )
+    assert len(read_calibration(path).cameras) == 6
+
+
+@pytest.mark.parametrize("centre", [True, False])
+def test_lengths_in_pixels_without_a_size_are_no_shares(tmp_path, centre):
+    path = scene_of(tmp_path, "images/{camera}", moments=1)
+    content = json.loads(path.read_text())
+    for key in ("w", "h"):
+        del content[key]
+    content["camera_angle_x"] = float(2 * np.arctan(540 / 1000))
+    if centre:
+        content |= {"cx": 540.0, "cy": 960.0}
+    path.write_text(json.dumps(content))
+    if not centre:
+        with pytest.raises(DataError, match="'cx' is missing"):
+            read_calibration(path)
+        return
+    camera = read_calibration(path).cameras["cam0"]
+    assert camera.size == (0, 0)
+    np.testing.assert_allclose(
+        camera.K, [[1000, 0, 540], [0, 1000, 960], [0, 0, 1]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K": [[1, 2], [3]]}, "'K' must hold finite numbers"),
+        ({"K": "abc"}, "'K' must hold finite numbers"),
+        (
+            {"name": None},
+            "camera 1 of the list: expected an object with a name",
+        ),
+        ({"name": "a"}, "camera 1 of the list.*found a"),
+    ],
+)
+def test_damaged_json_of_panoptic_is_named(tmp_path, change, message):
+    eye = np.eye(3).tolist()
+    good = {
+        "name": "a",
+        "resolution": [4, 4],
+        "K": eye,
+        "R": eye,
+        "t": [0, 0, 1],
+    }
+    path = tmp_path / "calibration.json"
+    path.write_text(
+        json.dumps({"cameras": [good, good | {"name": "b"} | change]})
+    )
+    with pytest.raises(DataError, match=message):
+        read_calibration(path)
+    path.write_text(json.dumps({"cameras": [good, None]}))
+    with pytest.raises(DataError, match="camera 1 of the list"):
+        read_calibration(path)
+    path.write_text(json.dumps({"imgSize": [4, 4], "a": good}))
+    with pytest.raises(DataError, match="camera imgSize: expected an object"):
+        read_calibration(path)
 
 
 def test_images_txt_without_lines_of_points(tmp_path):

@@ -320,13 +320,23 @@ def _read_dataset_json(
     """The cameras of CMU Panoptic's JSON, in cm, or of THuman4.0's and AvatarReX's, in metres."""
     content = read_json(path)
     listed = content.get("cameras")
-    entries = content
+    entries = list(content.items())
     if isinstance(listed, list):
-        entries = {str(entry.get("name")): entry for entry in listed}
-        scale = scale or 0.01
+        scale = scale or METRES["cm"]
+        entries = []
+        for number, entry in enumerate(listed):
+            name = entry.get("name") if isinstance(entry, dict) else None
+            if name is None or name in dict(entries):
+                raise DataError(
+                    f"{path}, camera {number} of the list: expected an object with a name of its "
+                    f"own, found {name}"
+                )
+            entries.append((str(name), entry))
     cameras = {}
-    for name, entry in entries.items():
+    for name, entry in entries:
         where = f"{path}, camera {name}"
+        if not isinstance(entry, dict):
+            raise DataError(f"{where}: expected an object with K, R and T")
 
         # The keys of either dataset.
         given = {}
@@ -336,14 +346,18 @@ def _read_dataset_json(
                 raise DataError(f"{where}: {' or '.join(names)} is missing")
             given[key] = entry[there[0]] if there else None
         width, height = numbers(where, given["size"], "size", (2,))
-        K = np.asarray(given["K"], np.float64).reshape(-1)
-        R = np.asarray(given["R"], np.float64).reshape(-1)
+
+        # Matrices may be lists of nine numbers.
+        for key in ("K", "R"):
+            values = as_floats(given[key])
+            if values.size == 9:
+                given[key] = values.reshape(3, 3)
         cameras[name] = make_camera(
             where,
             name,
-            K=K.reshape(3, 3) if K.size == 9 else K,
-            R=R.reshape(3, 3) if R.size == 9 else R,
-            t=np.asarray(given["t"], np.float64).reshape(-1),
+            K=given["K"],
+            R=given["R"],
+            t=given["t"],
             dist=given["dist"],
             size=(int(height), int(width)),
             scale=scale or 1.0,

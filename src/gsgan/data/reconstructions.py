@@ -7,6 +7,7 @@ camera that stands still have one pose.
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import permutations
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, NamedTuple
 
@@ -52,6 +53,10 @@ ONE_FOCAL = (
 )  # with one focal length
 # of a 2D point in images.bin: x, y, and the number of the 3D point
 POINT_BYTES = 24
+# lengths in pixels in nerfstudio's files
+PIXEL_KEYS = frozenset({"fl_x", "fl_y", "cx", "cy"})
+# What parts the words of a file's name.
+SEPARATOR = re.compile(r"[_\-. ]+")
 # Errors of reading a damaged file.
 DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.
@@ -86,8 +91,8 @@ def merge_cameras(
     """The cameras that took some images, by name.
 
     If the images lie in several folders, a part of their paths that differs names the camera: the
-    last folder whose images have one pose, or the file for folders of moments. Otherwise each image
-    is a camera.
+    last folder whose images have one pose, or the file for folders of moments. In one folder it may
+    be a word of the files' names. Otherwise each image is a camera.
 
     Args:
         path: of the file, for messages.
@@ -138,7 +143,7 @@ def _namings(
     paths = [PurePosixPath(view.image.replace("\\", "/")) for view in views]
     stems = [path.stem for path in paths]
     if len({path.parent for path in paths}) == 1:
-        return [_group(stems, views)]
+        return [*_by_words(stems, views), _group(stems, views)]
 
     # The folders that differ, the last one first; folders of different depths have their own names.
     ways = []
@@ -153,6 +158,25 @@ def _namings(
     # Folders of moments hold the images of all cameras.
     if len(set(stems)) < len(stems):
         ways.append(_group(stems, views))
+    return ways
+
+
+def _by_words(
+    stems: Sequence[str], views: Sequence[CalibratedImage]
+) -> list[dict[str, list[CalibratedImage]]]:
+    """The ways to group images of one folder by a word of their names where another, a number,
+    counts moments: frame_0001_cam1."""
+    words = [SEPARATOR.split(stem) for stem in stems]
+    if len({len(parts) for parts in words}) != 1:
+        return []
+    columns = [
+        column for column in zip(*words, strict=True) if len(set(column)) > 1
+    ]
+    ways = []
+    for names, moments in permutations(columns, 2):
+        counted = len(columns) == 2 and all(map(str.isdigit, moments))
+        if counted and len(set(names)) < len(views):
+            ways.append(_group(names, views))
     return ways
 
 
@@ -442,22 +466,28 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
             )
         return float(numbers(where, values.get(key, default), key, ()))
 
-    # The focal length, or the angle of view that gives it. A file without a size means that of the
-    # images: then lengths are shares of the width, and the centre is a share of each side.
-    unsized = "camera_angle_x" in values and not {"w", "h"} & set(values)
-    width = 1.0 if unsized else value("w")
-    height = 1.0 if unsized else value("h")
-    focal = None
-    if "camera_angle_x" in values:
-        focal = width / 2 / np.tan(value("camera_angle_x") / 2)
+    # A file without a size means that of the images: an angle of view alone gives lengths as shares
+    # of the width, and the centre as a share of each side; other lengths are in pixels.
+    unsized = not {"w", "h"} & set(values)
+    in_pixels = unsized and not PIXEL_KEYS.isdisjoint(values)
+    by_angle = "camera_angle_x" in values and not in_pixels
+    shares = unsized and by_angle
+    width = height = 1.0
+    if not unsized or not (in_pixels or by_angle):
+        width = value("w")
+        height = value("h")
 
-    # Without a second focal length, pixels are square.
+    # The focal length, or the angle of view that gives it. Without a second one, pixels are square.
+    focal = None
+    if "camera_angle_x" in values and (shares or not unsized):
+        focal = width / 2 / np.tan(value("camera_angle_x") / 2)
     fx = value("fl_x", focal)
 
     # The principal point is the middle of the image unless it is given.
+    middle = (None, None) if in_pixels else (width / 2, height / 2)
     K = np.array([[fx, 0, 0], [0, value("fl_y", fx), 0], [0, 0, 1.0]])
-    K[0, 2] = value("cx", width / 2)
-    K[1, 2] = value("cy", height / 2)
+    K[0, 2] = value("cx", middle[0])
+    K[1, 2] = value("cy", middle[1])
 
     # A fisheye lens has four radial terms; OpenCV's fourth of other lenses is another one.
     if value("k4", 0) != 0 and not fisheye:
