@@ -224,6 +224,78 @@ def test_an_image_in_a_data_uri_and_glossy_materials_are_read(tmp_path, tiny):
     )
 
 
+def with_normals(glb: TinyGlb, **more) -> TinyGlb:
+    """A normal map on a second set of coordinates, (0.75, 0.75) at all vertices."""
+    primitive = glb.doc.meshes[0].primitives[0]
+    count = glb.doc.accessors[primitive.attributes.POSITION].count
+    coordinates = np.full((count, 2), 0.75, "f4")
+    primitive.attributes.TEXCOORD_1 = glb.accessor(coordinates, "VEC2")
+    image = Image.fromarray(np.full((2, 2, 3), 128, np.uint8))
+    glb.doc.materials[0].normalTexture = pygltflib.NormalMaterialTexture(
+        index=glb.texture(image, "PNG"), texCoord=1, **more
+    )
+    return glb
+
+
+def test_normals_on_other_coordinates_than_colours_are_refused(tmp_path):
+    with pytest.raises(DataError, match="texCoord"):
+        read_character(with_normals(TinyGlb()).write(tmp_path / "a.glb"))
+
+
+def test_normals_alone_lie_on_their_own_coordinates(tmp_path):
+    moved = {"KHR_texture_transform": {"offset": [0.125, 0]}}
+    glb = with_normals(TinyGlb(), extensions=moved)
+    glb.doc.materials[0].pbrMetallicRoughness.baseColorTexture = None
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(character.uv[0], [0.875, 0.75])
+
+
+def test_glossy_colours_do_not_take_the_other_shaders_factor(tmp_path, tiny):
+    glb = TinyGlb()
+    glb.doc.materials[0].pbrMetallicRoughness.baseColorFactor = [0, 0, 0, 1]
+    glb.doc.materials[0].extensions = {
+        "KHR_materials_pbrSpecularGlossiness": {"diffuseTexture": {"index": 0}}
+    }
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(
+        character.surfaces[0].colour, tiny.surfaces[0].colour
+    )
+
+
+def test_alpha_of_vertices_does_not_count_in_opaque_materials(tmp_path, tiny):
+    glb = TinyGlb()
+    primitive = glb.doc.meshes[0].primitives[0]
+    count = glb.doc.accessors[primitive.attributes.POSITION].count
+    colours = np.tile(np.array([1, 1, 1, 0.5], "f4"), (count, 1))
+    primitive.attributes.COLOR_0 = glb.accessor(colours, "VEC4")
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(character.vertices, tiny.vertices)
+
+
+def test_damage_is_named_in_plain_words(tmp_path):
+    glb = TinyGlb()
+    glb.doc.images[0] = pygltflib.Image(uri="data:image/png;base64,AAAA")
+    with pytest.raises(DataError, match="image of texture 0 cannot be read"):
+        read_character(glb.write(tmp_path / "image.glb"))
+    glb = TinyGlb()
+    glb.doc.meshes[0].primitives[0].attributes.WEIGHTS_0 = None
+    with pytest.raises(DataError, match="has no weights"):
+        read_character(glb.write(tmp_path / "weights.glb"))
+    (tmp_path / "empty.glb").write_bytes(b"")
+    with pytest.raises(DataError, match="is empty"):
+        read_character(tmp_path / "empty.glb")
+
+
+def test_json_with_a_byte_order_mark_is_read(tmp_path, tiny):
+    document = pygltflib.GLTF2().load(str(TinyGlb().write(tmp_path / "a.glb")))
+    data = base64.b64encode(document.binary_blob()).decode()
+    document.buffers[0].uri = f"data:application/octet-stream;base64,{data}"
+    document.set_binary_blob(None)
+    path = tmp_path / "a.gltf"
+    path.write_text(document.to_json(), encoding="utf-8-sig")
+    np.testing.assert_array_equal(read_character(path).vertices, tiny.vertices)
+
+
 @pytest.mark.parametrize("turn", [[0.7071068, 0, 0, 0.7071068], [0, 0, 1, 0]])
 def test_a_person_who_lies_is_stood_up(tmp_path, turn, tiny):
     glb = TinyGlb()
@@ -554,7 +626,7 @@ def test_damaged_bytes_end_in_one_sentence(tmp_path):
     for damaged, message in (
         (data[: len(data) // 2], "damaged"),
         (data[:40] + b"\xff" * 200 + data[240:], "damaged"),
-        (b"", "not a glTF 2 file"),
+        (b"", "is empty"),
     ):
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=message):

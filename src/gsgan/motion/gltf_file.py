@@ -1,6 +1,7 @@
 """The numbers, images and nodes inside a glTF 2 file."""
 
 import base64
+import codecs
 import io
 import logging
 import struct
@@ -65,8 +66,10 @@ class GltfFile:
         path: Path,
         known: tuple[str, ...] | None = None,
     ) -> None:
-        data = path.read_bytes()
+        data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
         self.path = path
+        if not data:
+            raise DataError(f"{path} is empty (0 bytes); export it again")
 
         # Binary files begin with a magic number, others are JSON.
         if data[:4] == b"glTF":
@@ -179,7 +182,13 @@ class GltfFile:
         if content.startswith(KTX2):
             image = Image.fromarray(self._transcode(content))
         else:
-            image = Image.open(io.BytesIO(content)).convert("RGBA")
+            try:
+                image = Image.open(io.BytesIO(content)).convert("RGBA")
+            except (OSError, ValueError):
+                raise DataError(
+                    f"{self.path}: the image of texture {texture} cannot be read; export textures "
+                    "as PNG or JPEG"
+                ) from None
         image.thumbnail((MAX_IMAGE_SIDE, MAX_IMAGE_SIDE))
         return np.asarray(image)
 
@@ -200,7 +209,7 @@ class GltfFile:
             )
         image = self.doc.images[source]
         if image.bufferView is None:
-            return self._content(image.uri, "image")
+            return self._content(image.uri, "image") if image.uri else b""
         data, _ = self._view(image.bufferView)
         return bytes(data)
 

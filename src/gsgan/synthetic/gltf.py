@@ -282,22 +282,22 @@ def _part(
     if len(corners) and corners.max() >= len(position):
         raise ValueError("a face names a vertex that is not there")
 
-    # Texture coordinates, of the set that the base colour uses, or else the emission.
-    base = _base_texture(glb, primitive.material)
-    if base is None and primitive.material is not None:
-        base = glb.doc.materials[primitive.material].emissiveTexture
-    transform = (base and (base.extensions or {}).get(TRANSFORM)) or {}
-    uv_set = transform.get("texCoord", (base and base.texCoord) or 0)
+    # Texture coordinates, of the set that the material's textures use.
+    layout = _layout(_first_texture(glb, primitive.material))
     uv = np.zeros((len(position), 2))
-    if f"TEXCOORD_{uv_set}" in attributes:
-        uv = glb.accessor(attributes[f"TEXCOORD_{uv_set}"])
-    uv = _transform_uv(uv, transform)
+    if f"TEXCOORD_{layout.uv_set}" in attributes:
+        uv = glb.accessor(attributes[f"TEXCOORD_{layout.uv_set}"])
+    uv = _transform_uv(uv, layout.transform)
 
     # Colours of vertices multiply the base colour.
     colours = np.ones((len(position), 4))
     if "COLOR_0" in attributes:
         given = glb.accessor(attributes["COLOR_0"])
         colours[:, : given.shape[1]] = given
+    if primitive.material is None or _is_opaque(
+        glb.doc.materials[primitive.material]
+    ):
+        colours[:, 3] = 1
 
     # Exporters store the names of shapes with the mesh or with the primitive.
     names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
@@ -438,9 +438,13 @@ def _four_largest(
     joint_sets = []
     weight_sets = []
     for k in range(4):
-        if f"JOINTS_{k}" in attributes:
+        if {f"JOINTS_{k}", f"WEIGHTS_{k}"} <= attributes.keys():
             joint_sets.append(glb.accessor(attributes[f"JOINTS_{k}"]))
             weight_sets.append(glb.accessor(attributes[f"WEIGHTS_{k}"]))
+    if not joint_sets:
+        raise DataError(
+            f"{glb.path}: a skinned mesh has no weights (JOINTS_0, WEIGHTS_0); bind it to the bones"
+        )
     slots = np.concatenate(joint_sets, axis=1)
     weight = np.concatenate(weight_sets, axis=1)
 
@@ -465,6 +469,37 @@ def _base_texture(glb: GltfFile, material: int | None) -> Any:
     return shader and shader.baseColorTexture
 
 
+class _UvLayout(NamedTuple):
+    """Where on the texture coordinates of a primitive a texture lies."""
+
+    uv_set: int
+    transform: Mapping[str, Any]  # of KHR_texture_transform
+
+
+def _layout(texture: Any) -> _UvLayout:
+    """The layout of a texture info; the first coordinates without a texture."""
+    if texture is None:
+        return _UvLayout(0, {})
+    transform = (texture.extensions or {}).get(TRANSFORM) or {}
+    uv_set = transform.get("texCoord", texture.texCoord or 0)
+    moves = {key: transform[key] for key in transform if key != "texCoord"}
+    return _UvLayout(uv_set, moves)
+
+
+def _first_texture(glb: GltfFile, material: int | None) -> Any:
+    """The texture info whose coordinates a material's textures share, None without textures."""
+    base = _base_texture(glb, material)
+    if base is not None or material is None:
+        return base
+    entry = glb.doc.materials[material]
+    return entry.emissiveTexture or entry.normalTexture
+
+
+def _is_opaque(material: Any) -> bool:
+    """Whether alpha does not count."""
+    return material.alphaMode in (None, "", "OPAQUE")
+
+
 def _surface(glb: GltfFile, material: int) -> Surface:
     """Colours, normals and cut-off of a material; -1 is white."""
     white = np.full((1, 1, 4), 255, np.uint8)
@@ -476,16 +511,19 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     base = _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
     colour = glb.image(base.index) if base else white
-    glossy = (entry.extensions or {}).get(GLOSSY, {})
-    given = glossy.get("diffuseFactor") or (shader and shader.baseColorFactor)
+    glossy = (entry.extensions or {}).get(GLOSSY)
+    given = shader and shader.baseColorFactor
+    if glossy is not None:
+        given = glossy.get("diffuseFactor")
     factor = np.array(given or (1, 1, 1, 1), np.float64)
     if (factor != 1).any():
         colour = _scale(colour, factor)
-    colour = _with_emission(glb, entry, base, colour)
+    shared = _layout(_first_texture(glb, material))
+    colour = _with_emission(glb, entry, shared, colour)
 
     # Only materials that are not opaque are cut out by alpha.
     cutoff = 0.5 if entry.alphaCutoff is None else entry.alphaCutoff
-    if entry.alphaMode in (None, "", "OPAQUE"):
+    if _is_opaque(entry):
         cutoff = 0.0
         colour = colour.copy()
         colour[..., 3] = 255
@@ -493,7 +531,7 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     # Normal maps are optional.
     normal = None
     if entry.normalTexture is not None:
-        _refuse_other_transform(glb, entry.normalTexture, base)
+        _refuse_other_layout(glb, entry.normalTexture, shared)
         normal = glb.image(entry.normalTexture.index)[..., :3]
     return Surface(
         name=entry.name or "",
@@ -504,14 +542,14 @@ def _surface(glb: GltfFile, material: int) -> Surface:
 
 
 def _with_emission(
-    glb: GltfFile, entry: Any, base: Any, colour: Bytes
+    glb: GltfFile, entry: Any, shared: _UvLayout, colour: Bytes
 ) -> Bytes:
     """Colours ``[H, W, 4]`` plus the light that a material emits, as far as a colour can show it.
 
     Args:
         glb: the file.
         entry: the material.
-        base: the base colour's texture info, or None.
+        shared: the layout of all its textures.
         colour: of the material.
     """
     extensions = entry.extensions or {}
@@ -521,7 +559,7 @@ def _with_emission(
         return colour
     emitted = np.full((1, 1, 4), 255, np.uint8)
     if entry.emissiveTexture is not None:
-        _refuse_other_transform(glb, entry.emissiveTexture, base)
+        _refuse_other_layout(glb, entry.emissiveTexture, shared)
         emitted = glb.image(entry.emissiveTexture.index)
 
     # Both at the larger size; light is added.
@@ -536,15 +574,15 @@ def _with_emission(
     return result
 
 
-def _refuse_other_transform(glb: GltfFile, other: Any, base: Any) -> None:
+def _refuse_other_layout(
+    glb: GltfFile, texture: Any, shared: _UvLayout
+) -> None:
     """Refuses normals and light that lie elsewhere on the surface than colours: coordinates are
     shared."""
-    own = (other.extensions or {}).get(TRANSFORM) or {}
-    shared = (base and (base.extensions or {}).get(TRANSFORM)) or {}
-    if base is not None and own != shared:
+    if _layout(texture) != shared:
         raise DataError(
-            f"{glb.path}: {TRANSFORM} of a normal map or of emission differs from that of the base "
-            "colour; give both the same, or export without"
+            f"{glb.path}: {TRANSFORM} or texCoord of a normal map or of emission differs from that "
+            "of the base colour; give both the same, or export without"
         )
 
 
