@@ -17,6 +17,7 @@ from gsgan.prepare.options import Inputs
 from gsgan.prepare.run import with_detections
 from gsgan.prepare.sources import Recording
 from gsgan.utils.errors import DataError
+from gsgan.utils.frame_files import counting
 from gsgan.utils.image_files import read_colour
 
 REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
@@ -245,3 +246,36 @@ def test_the_reported_detections():
     )
     both = np.isfinite(old.px).all(-1) & np.isfinite(other.px).all(-1)
     assert np.abs(old.px - other.px)[both].max() < 2  # the same person
+
+
+def test_masks_of_another_suffix_are_named(tmp_path):
+    root = write_tiny_capture(tmp_path)
+    for path in (root / "masks").rglob("*.png"):
+        path.rename(path.with_suffix(".webp"))
+    with pytest.raises(
+        DataError, match=r"save the \.webp files there as \.png"
+    ):
+        CaptureReader()(root, Thresholds())
+
+
+def test_one_camera_that_counts_from_another_start_is_noted(tmp_path):
+    root = write_tiny_capture(tmp_path)
+    camera = sorted((root / "images").iterdir())[-1]
+    for path in sorted(camera.iterdir(), reverse=True):
+        number = int(path.stem) + 1
+        path.rename(path.with_stem(f"{number:06d}"))
+    notes = CaptureReader()(root, Thresholds()).notes
+    assert any(f"images of {camera.name} are numbered from" in n for n in notes)
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "landmarks3d.npz"])
+def test_empty_files_are_called_empty(tmp_path, name):
+    root = write_tiny_capture(tmp_path)
+    (root / name).write_bytes(b"")
+    with pytest.raises(DataError, match=rf"{name} is empty \(0 bytes\)"):
+        CaptureReader()(root, Thresholds())
+
+
+def test_times_beside_the_number_of_the_frame_do_not_count():
+    stems = [f"{k:06d}_{1698765000 + 33 * k}" for k in range(3)]
+    assert list(map(counting(stems), stems)) == [0, 1, 2]

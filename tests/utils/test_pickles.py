@@ -256,7 +256,7 @@ MISUSES = {
         b"\x8e" + struct.pack("<Q", 10**12) + b"x.",
         "EOFError",
     ),
-    "nothing": (b"", "valid pickle"),
+    "nothing": (b"", "is empty"),
     "a web page": (b"<!DOCTYPE html><html>not found</html>", "valid pickle"),
 }
 

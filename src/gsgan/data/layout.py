@@ -192,6 +192,10 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     masks = {frame for files in found.masks.values() for frame in files}
     others = {"masks": masks, "landmarks": landmarks.p}
     shifted = find_shifts(frames_of(found.images), others)
+    if not shifted:
+        for name, files in found.images.items():
+            own = {"masks": found.masks.get(name, {})}
+            shifted += find_shifts(files, own, f"images of {name}")
     notes = [*found.notes, *shifted]
     cause = None
     if shifted:

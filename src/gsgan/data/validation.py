@@ -14,7 +14,7 @@ from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.scene import NEAR
 from gsgan.utils.errors import DataError
-from gsgan.utils.frame_files import FrameFiles
+from gsgan.utils.frame_files import FrameFiles, entries
 from gsgan.utils.image_files import check_image
 
 Images = Mapping[str, FrameFiles]
@@ -287,10 +287,13 @@ def drop_unmasked(
         path = (
             expected[camera] / Path(images[camera][frame]).name
         ).with_suffix(".png")
+        suffixes = {Path(name).suffix for name in entries(expected[camera])}
+        other = sorted(suffixes - {"", ".png", ".jpg", ".jpeg"})
+        advice = f"; save the {other[0]} files there as .png" if other else ""
         raise DataError(
             f"{path} does not exist; every image needs a mask, and {len(lost[camera])} of the "
             f"{len(images[camera])} of camera {camera} are missing: {missing / count:.0%} of all "
-            f"{count} images have no mask, allowed are {limits.max_missing_masks:.0%}"
+            f"{count} images have no mask, allowed are {limits.max_missing_masks:.0%}{advice}"
         )
     notes.append(
         f"{missing} of {count} images have no mask and are left out "

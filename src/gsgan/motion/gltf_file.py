@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.motion.character import Bytes
 from gsgan.motion.rotations import Array
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import refuse_empty
 
 logger = logging.getLogger(__name__)
 # numpy's types of glTF's numbers of component types.
@@ -66,10 +67,9 @@ class GltfFile:
         path: Path,
         known: tuple[str, ...] | None = None,
     ) -> None:
+        refuse_empty(path)
         data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
         self.path = path
-        if not data:
-            raise DataError(f"{path} is empty (0 bytes); export it again")
 
         # Binary files begin with a magic number, others are JSON.
         if data[:4] == b"glTF":

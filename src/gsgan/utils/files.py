@@ -121,7 +121,14 @@ def read_json_value(path: Path) -> Any:
     except OSError as error:
         raise unreadable(path, error) from None
     except (ValueError, RecursionError) as error:
+        refuse_empty(path)
         raise DataError(f"{path} is not valid JSON: {error}") from None
+
+
+def refuse_empty(path: Path) -> None:
+    """Raises a DataError for a file of 0 bytes."""
+    if path.is_file() and path.stat().st_size == 0:
+        raise DataError(f"{path} is empty (0 bytes); copy or export it again")
 
 
 def unreadable(path: Path, error: OSError) -> DataError:

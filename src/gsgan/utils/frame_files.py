@@ -150,13 +150,16 @@ def entries(folder: Path) -> list[str]:
 
 
 def find_shifts(
-    images: Iterable[int], others: Mapping[str, Iterable[int]]
+    images: Iterable[int],
+    others: Mapping[str, Iterable[int]],
+    which: str = "images",
 ) -> list[str]:
     """Notes on files whose numbers are those of the images but for their start.
 
     Args:
         images: their frame numbers.
         others: those of other files, by what they are.
+        which: the images, in words.
     """
     given = sorted(images)
     notes = []
@@ -167,7 +170,7 @@ def find_shifts(
         first, other = given[0], ordered[0]
         if [frame - first for frame in given] == [n - other for n in ordered]:
             notes.append(
-                f"doubtful: images are numbered from {first}, {what} from {other}: number both "
+                f"doubtful: {which} are numbered from {first}, {what} from {other}: number both "
                 "alike, or every image gets what belongs to another moment"
             )
     return notes
@@ -177,14 +180,22 @@ def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
     """The function that gives the frame number of each of these stems.
 
     It is the last group of digits that differs between the stems: ``frame0012_cam1``,
-    ``000012_0``. Names often have other numbers in front, such as a date.
+    ``000012_0``. Names often have other numbers in front, such as a date; numbers too large for
+    frames, such as times, do not count where another one differs: ``000012_1698765432``.
     """
     groups = [DIGITS.findall(stem) for stem in stems]
     place = -1
     if len({len(group) for group in groups}) == 1:
+        differing = []
         for i, values in enumerate(zip(*groups, strict=True)):
             if len(set(values)) > 1:
-                place = i
+                differing.append(i)
+        usable = [
+            i
+            for i in differing
+            if all(frame_of(group[i]) is not None for group in groups)
+        ]
+        place = (usable or differing or [-1])[-1]
 
     def number(stem: str) -> int | None:
         digits = DIGITS.findall(stem)

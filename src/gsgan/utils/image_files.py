@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import unreadable
+from gsgan.utils.files import refuse_empty, unreadable
 
 ORIENTATION = 0x0112  # of EXIF
 TURNED = range(2, 9)  # its values besides upright
@@ -56,6 +56,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, str]:
     except Exception:  # Pillow raises many kinds on damage
         pass
     if header is None:
+        refuse_empty(path)
         raise DataError(
             f"{path} is not a valid PNG or JPEG file; copy or export it again"
         )

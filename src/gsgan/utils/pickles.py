@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import refuse_empty
 
 # joblib compresses by zlib, and names its own classes near the start.
 ZLIB = (b"x\x01", b"x\x5e", b"x\x9c", b"x\xda")
@@ -251,6 +252,7 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
             "was run: save its content as plain arrays with numpy.savez"
         ) from None
     except Exception as error:
+        refuse_empty(path)
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise DataError(
             f"{path} is not a valid {what} ({reason}); export it again"

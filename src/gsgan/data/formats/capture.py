@@ -284,11 +284,15 @@ def _file_problems(
                 f"{root / files.folder} lacks {len(lacking)} of {len(everywhere)} frames: "
                 f"{spans(lacking)}"
             )
+        unmasked = [frame for frame in files if frame not in masks]
+        if unmasked and f"of camera {camera} are missing" not in named:
+            yield (
+                f"{root / 'masks' / camera} lacks the masks of {len(unmasked)} of {len(files)} "
+                f"images: {spans(unmasked)}"
+            )
         for frame, path in files.items():
-            mask = masks.get(frame)
-            if mask is None:
-                mask = f"masks/{camera}/{frame:06d}.png"
-            for file in (root / path, root / mask):
+            both = [path, masks[frame]] if frame in masks else [path]
+            for file in (root / name for name in both):
                 problem = None if str(file) in named else _damage(file)
                 if problem is not None:
                     yield problem
