@@ -137,6 +137,14 @@ def test_a_header_without_a_length_is_unknown(tmp_path, monkeypatch):
     assert time[-1] > 3.8
 
 
+def test_the_length_of_a_recording_that_begins_late_is_unknown(tmp_path):
+    """Matroska's duration counts from 0, wherever the first image is."""
+    path = write_video(tmp_path / "a.mkv", range(300, 340))
+    assert video_recording(path, rotate=False).count is None
+    path = write_video(tmp_path / "b.mkv", range(40))
+    assert video_recording(path, rotate=False).count == 40
+
+
 def test_a_project_with_a_camera_of_twice_the_rate(tmp_path):
     project = write_project(tmp_path / "project", 3, 12)
     video = project / "videos" / "cam00.avi"

@@ -13,6 +13,7 @@ from gsgan.prepare.sources import (
     fit_size,
     pair_cameras,
     recording_notes,
+    refuse_unread,
     upright,
 )
 from gsgan.utils.errors import DataError
@@ -97,4 +98,18 @@ def test_hdr_colours_are_named_with_several_cameras(monkeypatch):
 def test_empty_and_cut_off_videos_are_named(tmp_path, content, what):
     (tmp_path / "a.mp4").write_bytes(content)
     with pytest.raises(DataError, match=what):
+        find_sources(tmp_path)
+
+
+def test_a_calibrated_video_of_an_unread_kind_is_named(tmp_path):
+    (tmp_path / "rig_cam01.h264").write_bytes(b"x")
+    (tmp_path / "notes.txt").write_text("x")
+    refuse_unread(tmp_path, ["cam02"])
+    with pytest.raises(DataError, match=r"rig_cam01\.h264: \.h264 is not read"):
+        refuse_unread(tmp_path, ["cam01"])
+
+
+def test_a_folder_named_as_a_video_is_none(tmp_path):
+    (tmp_path / "cam01.mp4").mkdir()
+    with pytest.raises(DataError, match="holds no videos"):
         find_sources(tmp_path)

@@ -20,6 +20,7 @@ from gsgan.prepare.sources import (
     fit_size,
     pair_cameras,
     recording_notes,
+    refuse_unread,
     upright,
 )
 from gsgan.skeleton.proportions import UP_AXES
@@ -237,6 +238,7 @@ def read_inputs(options: Options) -> Inputs:
         notes += [text for text in (turned, note) if text is not None]
     unused = sorted(set(calibration.cameras) - set(pairs.values()))
     if unused:
+        refuse_unread(next(iter(sources.values())).path.parent, unused)
         notes.append(
             f"calibrated without a video, left out: {', '.join(unused)}"
         )

@@ -1,7 +1,7 @@
 """The recordings: one video or one folder of images per camera, and which camera took which."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +25,25 @@ VIDEO_SUFFIXES = (
     ".mts",
     ".mpg",
     ".mpeg",
+)
+# videos that are not read
+UNREAD_SUFFIXES = (
+    ".264",
+    ".265",
+    ".3gp",
+    ".flv",
+    ".h264",
+    ".h265",
+    ".hevc",
+    ".insv",
+    ".m2ts",
+    ".mxf",
+    ".ogv",
+    ".ts",
+    ".wmv",
+)
+MAX_BEGIN = (
+    30  # images before the first one from which the header's length is doubtful
 )
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
@@ -135,7 +154,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
                 files=paths,
                 count=len(paths),
             )
-        elif path.suffix.lower() in VIDEO_SUFFIXES:
+        elif path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
             source = video_recording(path, rotate)
         else:
             continue
@@ -162,12 +181,19 @@ def video_recording(path: Path, rotate: bool) -> Recording:
     count = _length(video)
 
     # The header's size may differ from that of the images.
-    first = next(_decode(video), None)
+    images = _decode(video)
+    first = next(images, None)
+    began = video.get(cv2.CAP_PROP_PTS)
+    images.close()
     if first is None:
         raise DataError(
             f"{path} holds no image that can be decoded; convert it to H.264 MP4"
         )
     h, w = first.shape[:2]
+
+    # A recording that was cut out of a longer one may count the images before it.
+    if began > MAX_BEGIN:
+        count = 0
     return Recording(
         name=path.stem,
         path=path,
@@ -205,7 +231,7 @@ def _length(video: cv2.VideoCapture) -> int:
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
-def _decode(video: cv2.VideoCapture) -> Iterator[Bytes]:
+def _decode(video: cv2.VideoCapture) -> Generator[Bytes, None, None]:
     """The images of a video, which is closed at the end."""
     try:
         done, image = video.read()
@@ -214,6 +240,23 @@ def _decode(video: cv2.VideoCapture) -> Iterator[Bytes]:
             done, image = video.read()
     finally:
         video.release()
+
+
+def refuse_unread(folder: Path, cameras: Sequence[str]) -> None:
+    """Refuses videos of other suffixes that the calibrated ``cameras`` without a source fit.
+
+    Raises:
+        DataError: naming the file.
+    """
+    for name in sorted(entries(folder)):
+        path = folder / name
+        if path.suffix.lower() in UNREAD_SUFFIXES and matching_cameras(
+            path.stem, cameras
+        ):
+            raise DataError(
+                f"{path}: {path.suffix} is not read, since it may have no time stamps; convert it "
+                "to H.264 MP4"
+            )
 
 
 def pair_cameras(
