@@ -969,6 +969,26 @@ def test_relatives_of_smpl_are_the_same_motion(tmp_path, shared, proportions):
     with pytest.raises(DataError, match=r"one frame .* motion=.*fits$"):
         standard(fits / "000000.json", proportions, smpl=model)
 
+    # In a frame without a person the joints are missing.
+    (fits / "000002.json").write_text("[]")
+    clip = read_motion(fits, Source(proportions, smpl=model))
+    assert np.isnan(clip.p).all((1, 2)).tolist() == [
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
+    (fits / "000001.json").write_text(
+        json.dumps([{"keypoints3d": [[0, 0, 0, 1]]}])
+    )
+    with pytest.raises(
+        DataError, match=r"000001\.json: expected a fit of EasyMocap"
+    ):
+        read_motion(fits, Source(proportions, smpl=model))
+    with pytest.raises(DataError, match="found keypoints3d"):
+        read_motion(fits / "000001.json", Source(proportions))
+
     # AMASS' 52 joints with SMPL-H's model.
     smpl_h(tmp_path / "SMPLH.npz", smpl_arrays("smpl"))
     wide = np.zeros((5, 156))

@@ -89,6 +89,10 @@ MESHCAPADE_KEYS = {
     "frameRate": "fps",
 }
 FIT_KEYS = ("Rh", "Th", "poses", "shapes")
+NOBODY: tuple[Any, ...] = (
+    [],
+    {"annots": []},
+)  # frames of EasyMocap without a person
 EASYMOCAP_SMPLX = 87  # SMPL-X's body, 6 numbers for each hand, jaw and eyes
 SMPLH_COUNTS = (52, 6890)  # joints and vertices of SMPL-H
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
@@ -248,16 +252,23 @@ def read_fits(folder: Path, source: Source) -> Clip:
     """EasyMocap's fits, one JSON file for each frame: SMPL parameters of the person with the
     smallest id."""
     frames: dict[str, list[Any]] = {key: [] for key in FIT_KEYS}
-    for path in json_files(folder).values():
-        fits = _fits(read_json_value(path))
+    numbers = []
+    for number, path in json_files(folder).items():
+        content = read_json_value(path)
+        fits = _fits(content)
+        if content in NOBODY:
+            continue
         if not fits:
             raise DataError(
                 f"{path}: expected a fit of EasyMocap with {', '.join(FIT_KEYS)}"
             )
         fit = min(fits, key=lambda one: int(one.get("id", 0)))
+        numbers.append(number)
         for key in FIT_KEYS:
             frames[key].append(as_floats(fit[key]).ravel())
-    arrays: dict[str, NDArray[Any]] = {}
+    if not numbers:
+        raise DataError(f"{folder} has no frame with a person")
+    arrays: dict[str, NDArray[Any]] = {"frame_id": np.array(numbers)}
     for key, rows in frames.items():
         if len({row.size for row in rows}) != 1:
             raise DataError(f"{folder}: {key!r} differs in length by frame")
@@ -730,6 +741,11 @@ def _landmark_row(where: str, frame: Any) -> Float:
     points = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
+        if key is None and not any("andmark" in key for key in frame):
+            found = ", ".join(map(str, list(frame)[:6])) or "nothing"
+            raise DataError(
+                f"{where}: expected MediaPipe's pose_world_landmarks, found {found}"
+            )
         if key is None:
             raise DataError(
                 f"{where}: no pose_world_landmarks; MediaPipe's other landmarks are in image "

@@ -5,14 +5,17 @@ A pickle is a program that may call any function. `_Unpickler` gives it only the
 scipy.
 """
 
+import bz2
 import copyreg
 import io
+import lzma
 import math
 import pickle
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,8 +25,15 @@ from numpy.typing import NDArray
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import refuse_empty
 
-# joblib compresses by zlib, and names its own classes near the start.
-ZLIB = (b"x\x01", b"x\x5e", b"x\x9c", b"x\xda")
+# The first bytes of what joblib may compress with, and what undoes it. joblib names its own classes
+# near the start of a file.
+COMPRESSED: dict[bytes, Callable[[], Any]] = {
+    b"x": zlib.decompressobj,
+    b"\x1f\x8b": partial(zlib.decompressobj, wbits=31),
+    b"BZh": bz2.BZ2Decompressor,
+    b"\xfd7zXZ": lzma.LZMADecompressor,
+    b"\x5d\0\0": lzma.LZMADecompressor,
+}
 JOBLIB_HEAD = 4096  # bytes
 # What converts the first person of files that programs write with joblib.
 WHAM = "numpy.savez('{made}', **joblib.load('{given}')[0])"
@@ -271,9 +281,11 @@ def read_pickle(path: Path) -> Any:
     with _as_data_error(path, "pickle"):
         content = path.read_bytes()
     head = content[:JOBLIB_HEAD]
-    if head[:2] in ZLIB:
-        with _as_data_error(path, "pickle"):
-            head = zlib.decompressobj().decompress(head, JOBLIB_HEAD)
+    for magic, make in COMPRESSED.items():
+        if content.startswith(magic):
+            # Whatever fails here fails again below, with a message.
+            with suppress(EOFError, OSError, zlib.error, lzma.LZMAError):
+                head = make().decompress(content, JOBLIB_HEAD)
     if b"joblib.numpy_pickle" in head:
         line = FOUR_D_HUMANS if b"global_orient" in head else WHAM
         line = line.format(given=path.name, made=f"{path.stem}.npz")
