@@ -86,7 +86,6 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     from gsgan.skeleton import MEDIAPIPE33
     from gsgan.skeleton.proportions import measure_proportions
     from gsgan.synthetic.gltf import read_character
-    from gsgan.utils.config import defaults_of
 
     p = skeletons(8)
     source = Source(
@@ -176,9 +175,7 @@ def seeds(home: Path, run: Path) -> dict[str, list[tuple[Path, Reader]]]:
     own = Path(shutil.copytree(run, home / "run"))
     checkpoint = own / CHECKPOINT
     weights = home / "a.safetensors"
-    options = defaults_of("render")
-    options.run = str(own)
-    weights.write_bytes(safetensors_file(Run.from_config(options)))
+    weights.write_bytes(safetensors_file(Run.load(own, device="cpu")))
     add("ckpt", checkpoint, lambda path: load(path.parents[1]))
     torch.save({"gsgan": Hostile()}, home / "hostile.ckpt")
     add("ckpt", home / "hostile.ckpt", read_checkpoint)

@@ -131,11 +131,11 @@ def images(run: Path, curve: Curve, count: int, out: Path) -> str:
 def viewer(run: Path, curve: Curve, count: int) -> str:
     """Three clients move camera, motion and controls, each waiting for its image."""
     from gsgan.utils.config import defaults_of
-    from gsgan.view.server import Viewer
+    from gsgan.view.server import Viewer, ViewOptions
 
     config = defaults_of("view")
     config.run, config.port, config.device = str(run), 0, "cpu"
-    made = Viewer(config)
+    made = Viewer(ViewOptions.from_config(config))
     began, failures = time.monotonic(), list[str]()
     with curve.of("viewer", os.getpid()):
         share = [

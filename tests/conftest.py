@@ -164,7 +164,7 @@ def tiny(compose, capture):
 @pytest.fixture
 def build(tiny):
     """(data, avatar, frame) of a tiny config: everything real, everything small."""
-    from gsgan.run.assemble import build_avatar, build_data
+    from configs import build_avatar, build_data
 
     def run(*overrides: str):
         config = tiny(*overrides)

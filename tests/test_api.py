@@ -6,11 +6,10 @@ import sys
 
 import pytest
 import torch
+from configs import build_data, load_avatar
 
 import gsgan
 from gsgan.metrics.regions import on_background
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import load_avatar
 from gsgan.run.stored import CONFIG, load_config
 from gsgan.scene import cat
 from gsgan.skeleton import MEDIAPIPE33

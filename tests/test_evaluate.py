@@ -45,8 +45,8 @@ def painted(
     run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """The images of the tiny run as another method would leave them: 8-bit PNGs."""
-    from gsgan.run.assemble import build_data
-    from gsgan.run.runs import load_avatar
+    from configs import build_data, load_avatar
+
     from gsgan.run.stored import load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
@@ -68,8 +68,8 @@ def test_a_trained_avatar_is_loaded_without_measuring_the_scene_again(
     run, monkeypatch
 ):
     """It would read images of every camera, which takes a minute of a long capture."""
-    from gsgan.run.assemble import build_data
-    from gsgan.run.runs import load_avatar
+    from configs import build_data, load_avatar
+
     from gsgan.run.stored import load_config
 
     config = load_config(run)
@@ -291,10 +291,10 @@ def test_the_ground_truth_as_prediction_on_white(
 
 def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     """By the alpha that each of its pictures has; the table is marked."""
+    from configs import build_data, load_avatar
+
     from gsgan.metrics.image import psnr
     from gsgan.metrics.regions import on_background
-    from gsgan.run.assemble import build_data
-    from gsgan.run.runs import load_avatar
     from gsgan.run.stored import load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
@@ -397,7 +397,7 @@ def test_one_wrong_image_is_named_and_nothing_is_written(
 def test_arguments_that_do_not_fit_together_are_refused(
     run, copy, given, compose
 ):
-    from gsgan.evaluate.run import evaluate_config
+    from configs import evaluate_config
 
     here = f"predictions={copy}"
     for arguments, words in (
@@ -466,8 +466,9 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
     """Parts before an interruption count."""
     from types import SimpleNamespace
 
+    from configs import build_training
+
     from gsgan.train import module as training
-    from gsgan.train.run import build_training
 
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(training.time, "monotonic", lambda: clock.now)

@@ -3,10 +3,12 @@
 import json
 import shutil
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from configs import build_data, build_training
 from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
@@ -15,9 +17,7 @@ from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.rendering import Rendering
-from gsgan.run.assemble import build_data
 from gsgan.scene import BodyPose, Frame, Gaussians
-from gsgan.train.run import build_training
 from gsgan.utils.frame_files import frame_files
 
 HERE = __name__
@@ -74,10 +74,11 @@ class Smoothness(nn.Module):
 class OneLayer(nn.Module):
     """A generator: one convolution of all maps, the pose code ignored."""
 
-    def __init__(self, feature_channels, segmentation_channels, skeleton_channels, pose_channels,
-                 supersample=1) -> None:  # fmt: skip
+    feature_bound = None
+
+    def __init__(self, channels) -> None:
         super().__init__()
-        inputs = feature_channels + segmentation_channels + skeleton_channels
+        inputs = channels.feature + channels.segmentation + channels.skeleton
         self.paint = nn.Conv2d(inputs, 4, 3, padding=1)
 
     def forward(self, F, S, p2d, g, fine=None, alpha=None) -> Tensor:
@@ -86,13 +87,18 @@ class OneLayer(nn.Module):
         )
 
 
+class OneLayerSettings:
+    def build(self, channels) -> OneLayer:
+        return OneLayer(channels)
+
+
 class Blobs(nn.Module):
     """A splatting baseline: grey spheres on the body that learn their colour alone."""
 
     features = 0  # channels of F besides the three of colour
 
     def __init__(
-        self, body, stature: float, sh_degree: int, count: int = 50
+        self, body, stature: float, sh_degree: int, count: int
     ) -> None:
         super().__init__()
         self.points, self.size = SkinnedPoints(body, count), 0.03 * stature
@@ -114,6 +120,14 @@ class Blobs(nn.Module):
             features[..., 0] * 0 + 0.9,
             features,
         )
+
+
+@dataclass
+class BlobSettings:
+    points: int
+
+    def build(self, body, stature: float, sh_degree: int) -> Blobs:
+        return Blobs(body, stature, sh_degree, self.points)
 
 
 def test_a_dataset_format(tiny, capture, tmp_path):
@@ -157,7 +171,7 @@ def test_a_loss_term(tiny):
 def test_a_generator(build, tmp_path):
     folder = tmp_path / "model" / "generator"
     folder.mkdir(parents=True)
-    content = f"_target_: {HERE}.OneLayer\n_partial_: true\n"
+    content = f"_target_: {HERE}.OneLayerSettings\n"
     (folder / "one_layer.yaml").write_text(content)
     path = f"hydra.searchpath=[file://{tmp_path}]"
     _, avatar, frame = build(path, "model/generator=one_layer")
@@ -174,11 +188,11 @@ def test_a_splatting_baseline(tiny):
         "scale_max",
         "scale_spacings",
         "logit_bound",
-        "points",
     )
     config = tiny(
         "model=lbs_splat",
-        f"model.surface._target_={HERE}.Blobs",
+        f"model.surface._target_={HERE}.BlobSettings",
+        "model.surface.points=50",
         *(f"~model.surface.{key}" for key in keys),
     )
     data, module = build_training(config)

@@ -148,3 +148,22 @@ def test_no_public_class_name_is_defined_twice():
                 names.append(node.name)
     twice = {name for name in names if names.count(name) > 1}
     assert not twice
+
+
+def annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """The types of a function's arguments."""
+    arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    types = [argument.annotation for argument in arguments]
+    return [ast.unparse(kind) for kind in types if kind is not None]
+
+
+def test_configs_end_at_the_door():
+    """A command's options are read from its config once; values travel on."""
+    takers = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            if any("DictConfig" in kind for kind in annotations(node)):
+                takers.append(f"{module_name(path)}.{node.name}")
+    assert len(takers) <= 12, takers

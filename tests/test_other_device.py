@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import quiet_trainer
+from configs import build_training
 from hydra.utils import instantiate
 from lightning import Callback
 from lightning.pytorch.accelerators import CPUAccelerator
@@ -20,7 +21,6 @@ from gsgan.fit.frames import MaskedFrames
 from gsgan.model.harmonic import distil
 from gsgan.scene import BodyPose
 from gsgan.train.callbacks import WholeSchedule
-from gsgan.train.run import build_training
 
 
 def test_the_device_refuses_what_a_gpu_refuses(monkeypatch):

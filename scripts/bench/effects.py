@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from timing import interleaved, median
 from gsgan.bench.common import NOTHING, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
 from gsgan.fit.run import fit_before_training
-from gsgan.run.assemble import build_data
+from gsgan.run.assemble import RunSettings
 from gsgan.run.runs import load_avatar
 from gsgan.run.stored import load_config
 from gsgan.utils.arrays import evenly_spaced
@@ -164,11 +165,12 @@ def decide(row: Row, base: Sequence[str]) -> None:
         config = compose(
             "train", [*base, *row.overrides, f"effects.{row.effect}=auto"]
         )
-    data = build_data(config)
+    settings = RunSettings.from_config(config)
+    data = copy(settings.data).read()
     if data.lacks_body:
         fit_before_training(data, instantiate(config.fit), torch.device("cpu"))
-        data = build_data(config)
-    decisions = decide_effects(data.info, instantiate(config.effects))
+        data = settings.data.read()
+    decisions = decide_effects(data.info, settings.avatar.effects)
     found = getattr(decisions, row.effect)
     row.auto, row.why = found.on, found.why
 
@@ -193,8 +195,9 @@ def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
     for state, name in zip(("off", "on"), row.runs, strict=True):
         config = load_config(folder / name)
         config.data.cache_mb = 0  # every frame is read again
-        data = build_data(config)
-        avatar, _ = load_avatar(folder / name, config, data)
+        settings = RunSettings.from_config(config)
+        data = settings.data.read()
+        avatar, _ = load_avatar(folder / name, settings.avatar, data)
         dataset = data.dataset(row.split)
         chosen = evenly_spaced(len(dataset), frames)
         count, shown = len(chosen), [dataset[i] for i in chosen]

@@ -23,6 +23,7 @@ from gsgan.bench.common import NOTHING, check_whole, markdown, number, sentence
 from gsgan.bench.speed import (
     REST_STAGE,
     TOTAL,
+    SpeedOptions,
     load_subject,
     make_painter,
     measure,
@@ -57,7 +58,8 @@ def run(config: DictConfig, folder: Path) -> None:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):
             speed = compose("bench_speed", [f"size={size}", *config.speed])
         speed.poses = config.poses
-        avatar, frames, _, _ = load_subject(speed, bench.device)
+        options = SpeedOptions.from_config(speed)
+        avatar, frames, _, _ = load_subject(options, bench.device)
         with without_denormals():
             painter = make_painter(avatar)
             times = measure(

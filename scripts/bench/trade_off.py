@@ -38,8 +38,8 @@ from gsgan.bench.speed import (
 from gsgan.data.datamodule import GsganData
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.model.avatar import Avatar
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import load_avatar
+from gsgan.run.assemble import RunSettings
+from gsgan.run.runs import avatar_settings, load_avatar
 from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
@@ -323,10 +323,11 @@ def load(
                 f"{folder.name} was trained on other data, or at another size, than {first.name}: "
                 "their scores cannot stand side by side; leave one out"
             )
-    data = build_data(standard)
+    data = RunSettings.from_config(standard).data.read()
     avatars, marks = {}, dict[str, None]()
     for folder, stored in configs.items():
-        avatar, found = load_avatar(folder, stored, data)
+        settings = avatar_settings(folder, stored)
+        avatar, found = load_avatar(folder, settings, data)
         avatars[folder] = place(avatar, bench.device, channels_last=True)
         marks |= dict.fromkeys(found)
 
@@ -337,11 +338,10 @@ def load(
         ]
 
     elsewhere = DataPaths(config.far_root, config.data_smpl)
-    far = (
-        shown(build_data(load_config(first, elsewhere)))
-        if config.far_root
-        else []
-    )
+    far = []
+    if config.far_root:
+        moved_config = load_config(first, elsewhere)
+        far = shown(RunSettings.from_config(moved_config).data.read())
     painters = [Painter(avatars[point.folder], point.way) for point in points]
     return painters, shown(data), far, list(marks)
 

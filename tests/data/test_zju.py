@@ -212,7 +212,7 @@ def test_labels_beyond_cihp_are_ignored(root, smpl_file):
 def test_the_config_trains_with_segmentation_on_cihp_labels(
     compose, written, smpl_file
 ):
-    from gsgan.run.runs import build_avatar, build_data
+    from configs import build_avatar, build_data
 
     config = compose(
         "train",

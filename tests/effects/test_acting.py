@@ -7,13 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import arguments
+from configs import build_data, load_avatar
 from make import write_tiny_capture
 from omegaconf import OmegaConf
 from operators import Calls
 
 from gsgan.model.colour import ColourCorrection
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import load_avatar
 from gsgan.run.stored import load_config, read_checkpoint
 
 NONE = "effects=none"

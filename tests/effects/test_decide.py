@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from configs import build_data
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
@@ -14,7 +15,6 @@ from gsgan.effects import (
     decide,
 )
 from gsgan.effects.decide import CHOICES
-from gsgan.run.assemble import build_data
 from gsgan.utils.errors import ConfigError
 
 ALIKE = SurfaceColours(difference=0.01, residual=0.05)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from configs import build_training
 
 from gsgan.evaluate.align import align_poses
-from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
 
 

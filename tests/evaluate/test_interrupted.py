@@ -5,9 +5,9 @@ import shutil
 
 import pandas as pd
 import pytest
+from configs import evaluate_config
 
 from gsgan.evaluate import kept
-from gsgan.evaluate.run import evaluate_config
 from gsgan.evaluate.scores import Tally
 from gsgan.utils.errors import ConfigError, DataError
 

@@ -52,7 +52,6 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
 
 def test_a_ply_says_how_it_is_filtered(bare, tmp_path, inside, monkeypatch):
     """The header has Brush's comment where the avatar was trained with effects.antialias."""
-    from gsgan.run.runs import Run
 
     splats = Splats(
         means=np.zeros((1, 3), np.float32),
@@ -67,16 +66,18 @@ def test_a_ply_says_how_it_is_filtered(bare, tmp_path, inside, monkeypatch):
     assert marked.replace(line, b"\n") == plain
 
     # The command, with and without the effect.
-    load = Run.from_config
+    from gsgan.run.runs import Run
+
+    load = Run.load
     for antialias in (False, True):
 
-        def changed(config, device, antialias=antialias):
-            run = load(config, device)
+        def changed(*given, antialias=antialias):
+            run = load(*given)
             accuracy = replace(run.avatar.accuracy, antialias=antialias)
             run.avatar.accuracy = accuracy
             return run
 
-        monkeypatch.setattr(Run, "from_config", changed)
+        monkeypatch.setattr(Run, "load", changed)
         out = tmp_path / f"{antialias}.ply"
         result = inside("export", f"run={bare}", f"out={out}")
         assert result.returncode == 0, result.stderr
@@ -133,12 +134,13 @@ def test_an_unfinished_run_says_so():
 
 
 def test_safetensors_name_no_class_but_gsgans_own(run, compose, tmp_path):
+    from configs import load_run
+
     from gsgan.export.weights import load_weights, safetensors_file
-    from gsgan.run.runs import Run
     from gsgan.run.stored import read_config
 
     config = compose("export", f"run={run}", "+device=cpu")
-    content = safetensors_file(Run.from_config(config))
+    content = safetensors_file(load_run(config))
     path = tmp_path / "a.safetensors"
     path.write_bytes(content)
     assert load_weights(path).splats is not None

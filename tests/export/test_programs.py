@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from configs import load_run
 from safetensors.torch import save_file
 
 import gsgan
@@ -15,7 +16,6 @@ from gsgan.export.programs import (
     unfrozen,
 )
 from gsgan.export.weights import load_weights, safetensors_file
-from gsgan.run.runs import Run
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3
@@ -149,7 +149,7 @@ def test_safetensors_give_the_run_back(run, build, compose, tmp_path):
     avatar, (_, _, frame) = gsgan.load(run), build()
     path = tmp_path / "a.safetensors"
     config = compose("export", f"run={run}", "+device=cpu")
-    path.write_bytes(safetensors_file(Run.from_config(config)))
+    path.write_bytes(safetensors_file(load_run(config)))
     again = load_weights(path)
     given = frame.skeleton, frame.camera
     assert torch.equal(

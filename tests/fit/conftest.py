@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configs import run_fit
 from fit_quick import QUICK
 from hydra import compose as compose_config
 from hydra import initialize_config_dir
 from make import write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
-from gsgan.fit.run import run_fit
 from gsgan.utils.config import config_folder
 
 SPLITS = {

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
+from configs import run_fit
 from fit_quick import QUICK
 from hydra.utils import instantiate
 from make import edit_npz, write_hands, write_tiny_capture
@@ -24,9 +25,9 @@ from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import ScoreOptions, make_scorer
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.frames import MaskedFrames, rotate_cameras
-from gsgan.fit.run import fit_before_training, refuse_other_fit, run_fit
+from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.fit.shape import fit_shape
-from gsgan.run.assemble import moves_with_body
+from gsgan.run.assemble import AvatarSettings
 from gsgan.scene import BodyPose
 from gsgan.train.resume import training_record
 from gsgan.utils.errors import ConfigError, DataError
@@ -162,7 +163,7 @@ def test_what_is_written_is_read(fitted, people, compose):
 def test_scores_say_that_held_out_frames_were_registered(
     fitted, fit, people, compose, tmp_path
 ):
-    options = ScoreOptions(lpips_nets=[])
+    options = ScoreOptions(lpips={"nets": [], "path": None})
     assert not any(
         "fitted" in mark
         for mark in make_scorer(options, GsganData(str(fitted)), []).marks
@@ -504,4 +505,5 @@ def test_cameras_rotate():
 def test_only_models_that_move_with_a_body_need_a_fit(
     compose, overrides, moves
 ):
-    assert moves_with_body(compose("train", *overrides)) is moves
+    settings = AvatarSettings.from_config(compose("train", *overrides))
+    assert settings.moves_with_body is moves

@@ -4,11 +4,12 @@ import dataclasses
 
 import pytest
 import torch
+from configs import build_avatar
 from make import write_tiny_capture
 from test_freeze import left_of_zero
 from writers.smpl import write_smpl
 
-from gsgan.run.assemble import build_avatar, naming_group
+from gsgan.run.assemble import naming_group
 from gsgan.scene import cat
 from gsgan.utils.errors import ConfigError
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from commands import TINY
+from configs import build_data
 from make import write_face, write_hands
 
 import gsgan
@@ -14,7 +15,6 @@ from gsgan.body import free_body
 from gsgan.export.splats import splats_of
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.pose_graph import pose_inputs
-from gsgan.run.assemble import build_data
 from gsgan.run.drive import Drive, inputs_of, rest_pose
 from gsgan.run.stored import load_config
 from gsgan.skeleton import TEMPLATES, bone_frames, face_code

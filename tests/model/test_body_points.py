@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import stored
+from configs import build_training, load_avatar
 from hydra.errors import ConfigCompositionException
 from tiny_characters import TINY
 from torch.nn import functional
@@ -16,10 +17,8 @@ from gsgan.body.skinned import neighbours_on_surface, vertex_normals
 from gsgan.data.datamodule import GsganData
 from gsgan.data.surface_colours import body_inside
 from gsgan.model.body_points import BodyPoints, move_normals
-from gsgan.run.runs import load_avatar
 from gsgan.scene import BodyPose
 from gsgan.synthetic.scenes import ensure_scene
-from gsgan.train.run import build_training
 from gsgan.utils.errors import DataError
 
 ON = "effects.body_points=on"

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from configs import build_training
 
 from gsgan.body import open_body
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import Deformation
 from gsgan.model.harmonic import distil
 from gsgan.scene import BodyPose
-from gsgan.train.run import build_training
 from gsgan.utils.tensors import matvec
 
 ON = "effects.body_points=on"

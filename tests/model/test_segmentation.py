@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from configs import build_data, load_avatar
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
 from gsgan.body import blend_transforms, free_body, skin
@@ -18,8 +19,6 @@ from gsgan.model.segmentation import (
     segmentation_loss,
     turn_to,
 )
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import load_avatar
 from gsgan.run.stored import DataPaths, load_config
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError

@@ -15,7 +15,6 @@ from rich.console import Console
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.__main__ import prepare as command
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import SolveSettings
@@ -261,7 +260,7 @@ def test_every_key_of_the_config_is_understood(project, compose, capsys):
         f"masks={project / 'masks'}",
         "cameras={cam00: cam00}",
     )
-    command(config)
+    prepare(Options.from_config(config))
     assert "is ready" in capsys.readouterr().out
     defaults = instantiate(
         compose("prepare", "source=a", "out=b"), _convert_="all"

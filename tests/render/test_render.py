@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
+from configs import build_data, build_training, load_avatar
 from make import write_tiny_capture
 from omegaconf import OmegaConf
 from PIL import Image
@@ -20,11 +21,9 @@ from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
 from gsgan.render import run as render_run
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import Run, load, load_avatar
+from gsgan.run.runs import Run, load
 from gsgan.run.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
 
 

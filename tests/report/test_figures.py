@@ -8,12 +8,11 @@ import cv2
 import pytest
 import torch
 from commands import refused
+from configs import build_data, load_avatar
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
 from gsgan.report.figures.run import FIGURES
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import load_avatar
 from gsgan.run.stored import load_config
 
 FEW = ("shots.strip=2",)

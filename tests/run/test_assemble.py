@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from configs import build_avatar, build_training
 from hydra.utils import instantiate
 from rich.console import Console
 from test_extending import OneLayer
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.model.generator import Generator
-from gsgan.run.assemble import build_avatar
 from gsgan.train.description import describe
 from gsgan.train.module import fit_schedule
-from gsgan.train.run import build_training
 from gsgan.utils.config import config_folder
 
 SIZES = sorted(path.stem for path in (config_folder() / "size").glob("*.yaml"))
@@ -76,7 +75,7 @@ def test_a_generator_of_ones_own_is_built_at_every_size(
 ):
     folder = tmp_path / "model" / "generator"
     folder.mkdir(parents=True)
-    content = f"_target_: {OneLayer.__module__}.OneLayer\n_partial_: true\n"
+    content = f"_target_: {OneLayer.__module__}.OneLayerSettings\n"
     (folder / "one_layer.yaml").write_text(content)
     path = f"hydra.searchpath=[file://{tmp_path}]"
     given = (path, f"size={size}", "model/generator=one_layer")

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 import torch
 from commands import stored
+from configs import build_avatar, build_data, build_training, load_avatar
 from frames import frame_of
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
 from gsgan.model.body_points import neighbour_distance
-from gsgan.run.assemble import build_avatar, build_data
 from gsgan.run.class_vote import class_vote, find_visible
-from gsgan.run.runs import load_avatar
 from gsgan.scene import BodyPose, Camera, Frame
-from gsgan.train.run import build_training
 from gsgan.utils.errors import DataError
 
 FOCAL, SIZE = 40.0, 32

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import quiet_trainer
+from configs import build_training
 from torch.utils.data import DataLoader
 
 from gsgan.scene import Frame, cat
 from gsgan.train.module import AvatarTraining
-from gsgan.train.run import build_training
 from stability.cases.poses import DEGENERATE
 
 TO_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])

@@ -4,10 +4,10 @@ import math
 
 import pytest
 from commands import quiet_trainer
+from configs import build_training
 from lightning import Trainer
 
 from gsgan.train.module import AvatarTraining
-from gsgan.train.run import build_training
 
 
 @pytest.fixture

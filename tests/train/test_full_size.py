@@ -5,9 +5,9 @@ import resource
 import pytest
 import torch
 from commands import quiet_trainer
+from configs import build_training
 
 from gsgan.train.module import AvatarTraining
-from gsgan.train.run import build_training
 from gsgan.utils.tensors import keep_freed_memory
 
 STEP_ONE, BEFORE_GAN, GAN = 120, 40, 40

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import torch
 from commands import refused, train
+from configs import build_data
 from lightning.pytorch.loggers import wandb as wandb_logger
 from PIL import Image
 
 from gsgan.evaluate.run import choice_marks
-from gsgan.run.assemble import build_data
-from gsgan.run.stored import CHECKPOINT, read_checkpoint
+from gsgan.run.stored import CHECKPOINT, Chosen, read_checkpoint
 from gsgan.utils.sweeps import STOPPED
 
 
@@ -92,15 +92,17 @@ def test_scores_tell_that_held_out_images_chose_something(tiny):
     cut = tiny("callbacks=[early_stop]")
     data = build_data(cut)
     assert data.watched[0] == "validation"
-    assert choice_marks(cut, data) == []
+    assert choice_marks(Chosen.of(cut), data) == []
     uncut = tiny("callbacks=[early_stop]", "data.validation_frames=null")
     data = build_data(uncut)
-    (mark,) = choice_marks(uncut, data)
+    (mark,) = choice_marks(Chosen.of(uncut), data)
     assert mark == "callbacks.early_stop watched held-out images"
     searched = tiny("objective=novel_pose.full.psnr")
-    (mark,) = choice_marks(searched, data)
+    (mark,) = choice_marks(Chosen.of(searched), data)
     assert "novel_pose.full.psnr" in mark
-    assert not choice_marks(tiny("objective=validation.full.psnr"), data)
+    assert not choice_marks(
+        Chosen.of(tiny("objective=validation.full.psnr")), data
+    )
 
 
 def test_a_remote_copy_without_an_address_is_refused(trained):

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from configs import load_avatar
 
-from gsgan.run.runs import load_avatar
 from gsgan.train.optimisers import MovingAverage
 from gsgan.utils.errors import ConfigError
 

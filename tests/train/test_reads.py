@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from commands import quiet_trainer
+from configs import build_training
 from lightning import Callback
 from torch.overrides import TorchFunctionMode
 from torch.utils.data import DataLoader
@@ -18,7 +19,6 @@ from torch.utils.data import DataLoader
 import gsgan
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.scores import Preparation, Scorer, painter, score_split
-from gsgan.train.run import build_training
 
 SOURCE = Path(gsgan.__file__).parent
 # checks of values, boxes of p₂D's lines, and the box that the generator paints

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from commands import TINY
+from configs import build_training
 from rich.console import Console
 
 from gsgan.body import open_body
@@ -25,7 +26,6 @@ from gsgan.train.registration import (
     projection_slope,
     sample_image,
 )
-from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
 
 ON = "effects.body_points=on"

@@ -1,11 +1,13 @@
 """What a run does before it trains: its folder, its device."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from omegaconf import OmegaConf
+from lightning import Trainer
 
 from gsgan.train.resume import remove_old_results
-from gsgan.train.trainer import device_of
+from gsgan.train.trainer import TrainerFactory
 
 
 def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
@@ -30,10 +32,12 @@ def test_every_process_probes_and_fits_on_its_own_gpu(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for name in ("LOCAL_RANK", "SLURM_LOCALID"):
         monkeypatch.delenv(name, raising=False)
-    settings = OmegaConf.create({"accelerator": "auto", "devices": devices})
+    factory = TrainerFactory(
+        make=Trainer, accelerator="auto", devices=devices, precision="32-true"
+    )
     first = 0 if devices == "auto" else devices[0]
-    assert device_of(settings) == torch.device("cuda", first)
+    assert factory.device == torch.device("cuda", first)
     monkeypatch.setenv(launcher, "2")
-    assert device_of(settings) == torch.device("cuda", expected)
-    settings.accelerator = "cpu"
-    assert device_of(settings) == torch.device("cpu")
+    assert factory.device == torch.device("cuda", expected)
+    on_cpu = replace(factory, accelerator="cpu")
+    assert on_cpu.device == torch.device("cpu")

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
+from configs import load_run
 
 from gsgan.run.drive import MotionOptions, drive_of
-from gsgan.run.runs import Run
 from gsgan.view.session import Session, Show
 
 DEVICE = os.environ.get("GPU_CHECK_DEVICE", "cpu")
@@ -52,7 +52,7 @@ def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
     config = compose(
         "view", f"run={run}", f"device={DEVICE}", "motion=novel_pose"
     )
-    loaded = Run.from_config(config)
+    loaded = load_run(config)
     assert next(loaded.avatar.parameters()).device.type == DEVICE
     drive = replace(
         drive_of(MotionOptions.from_config(config), loaded, 30.0), body=None

@@ -19,7 +19,7 @@ PATIENCE = 60.0  # seconds
 
 @contextlib.contextmanager
 def served(compose, run):
-    from gsgan.view.server import Viewer
+    from gsgan.view.server import Viewer, ViewOptions
 
     given = (
         f"run={run}",
@@ -28,7 +28,7 @@ def served(compose, run):
         "max_upload=1",
         "background=white",
     )
-    made = Viewer(compose("view", *given))
+    made = Viewer(ViewOptions.from_config(compose("view", *given)))
     yield made
     made.stop()
 
@@ -253,22 +253,24 @@ def test_all_addresses_of_the_machine_are_printed(viewer, monkeypatch):
 
 
 def test_an_origin_that_is_no_address_is_refused(bare, compose):
-    from gsgan.view.server import Viewer
+    from gsgan.view.server import Viewer, ViewOptions
 
+    config = compose("view", f"run={bare}", "origin=name", "motion=rest")
+    options = ViewOptions.from_config(config)
     with pytest.raises(ConfigError, match="origin must be"):
-        Viewer(compose("view", f"run={bare}", "origin=name", "motion=rest"))
+        Viewer(options)
 
 
 def test_an_ipv6_address(bare, compose):
-    from gsgan.view.server import Viewer
+    from gsgan.view.server import Viewer, ViewOptions
 
     try:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError:
         pytest.skip("no IPv6 here")
-    viewer = Viewer(
-        compose("view", f"run={bare}", "host='::1'", "port=0", "motion=rest")
-    )
+    given = ("host='::1'", "port=0", "motion=rest")
+    config = compose("view", f"run={bare}", *given)
+    viewer = Viewer(ViewOptions.from_config(config))
     try:
         assert viewer.address == f"http://[::1]:{viewer.server.get_port()}"
         assert urlopen(viewer.address).status == 200

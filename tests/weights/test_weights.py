@@ -243,7 +243,7 @@ def test_training_stops_before_its_first_iteration(
 
 
 def test_a_model_without_a_generator_needs_no_weights(nowhere, tiny):
-    from gsgan.train.run import build_training
+    from configs import build_training
 
     given = ("model=splat_only", "training.perceptual.weights=pretrained")
     assert build_training(tiny(*given))[1].perceptual is None

@@ -11,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 
 from gsgan.utils import pages
 from gsgan.utils.checks import whole
@@ -91,8 +90,7 @@ def markdown(frame: pd.DataFrame) -> str:
     )
 
 
-def check_whole(config: DictConfig, **minimum: int) -> None:
+def check_whole(values: Mapping[str, Any], **minimum: int) -> None:
     """Raises ConfigError for keys that are not whole numbers of at least the given value."""
-    # Keys of the config are the names of the arguments.
     for name, low in minimum.items():
-        whole(name, config[name], low)
+        whole(name, values[name], low)

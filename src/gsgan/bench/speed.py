@@ -3,16 +3,17 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from gsgan.bench.common import (
@@ -24,13 +25,14 @@ from gsgan.bench.common import (
 )
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar, watch_nothing
-from gsgan.run.assemble import build_avatar, build_data
-from gsgan.run.runs import load_avatar
-from gsgan.run.stored import DataPaths, load_config
+from gsgan.run.assemble import RunSettings, build_avatar
+from gsgan.run.runs import RunReference, load_avatar
+from gsgan.run.stored import load_config
 from gsgan.scene import Frame, cat
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, write_json
@@ -50,59 +52,89 @@ SHOWN_SPLITS = ("novel_pose", "novel_view", "train")
 Painter = Callable[[Frame], Tensor]
 
 
-def run(config: DictConfig, folder: Path) -> None:
+@dataclass(frozen=True)
+class SpeedOptions(CommandOptions):
+    """The options of gsgan.bench speed: conf/bench_speed.yaml.
+
+    Args:
+        image: pixels, height and width of an untrained avatar's images.
+        untrained: an avatar and its data, where no run is given.
+    """
+
+    source: RunReference
+    untrained: RunSettings
+    image: int
+    frames: int
+    warmup: int
+    poses: int
+    batch: int
+    seed: int
+    precision: str
+    channels_last: bool
+    backend: str
+    threads: int | None
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> Self:
+        """The options of a config, whose group ``size`` has the pixels."""
+        with_pixels = config.copy()
+        OmegaConf.set_struct(with_pixels, False)
+        with_pixels.image = config.size.image
+        return super().from_config(with_pixels)
+
+
+def run(options: SpeedOptions) -> None:
     """Times ``avatar.render(skeleton, camera)``; writes ``speed.md`` and ``speed.json``.
 
     The input is bare skeletons, one at a time as a camera delivers them, and in batches. Skeletons
     and cameras are on the CPU, images stay on the device: reading and displaying them is not
     included.
 
-    Args:
-        config: as conf/bench_speed.yaml.
-        folder: where they go.
+    They go into Hydra's output folder.
 
     Raises:
         ConfigError: on a value out of range.
         DataError: when the run or its data cannot be read.
     """
     # Every value is checked before anything is loaded.
-    check_whole(config, frames=1, warmup=0, poses=1, batch=1, seed=0)
-    one_of("channels_last", config.channels_last, (True, False))
-    one_of("precision", config.precision, PRECISIONS)
-    one_of("backend", config.backend, BACKENDS)
-    if config.threads is not None:
-        check_whole(config, threads=1)
-        torch.set_num_threads(config.threads)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    check_whole(vars(options), frames=1, warmup=0, poses=1, batch=1, seed=0)
+    one_of("channels_last", options.channels_last, (True, False))
+    one_of("precision", options.precision, PRECISIONS)
+    one_of("backend", options.backend, BACKENDS)
+    if options.threads is not None:
+        check_whole(vars(options), threads=1)
+        torch.set_num_threads(options.threads)
 
     # The machine is part of the result.
     console = make_console()
-    device = pick_device(config.device)
+    device = pick_device(options.source.device)
     where = environment(device)
 
     # The run is loaded once; the same painter is timed one by one and in batches.
-    avatar, frames, name, marks = load_subject(config, device)
-    painter = make_painter(avatar, config.precision, config.backend)
+    avatar, frames, name, marks = load_subject(options, device)
+    painter = make_painter(avatar, options.precision, options.backend)
     with without_denormals(), progress(console) as bars:
-        task = bars.add_task("painting", total=config.warmup + config.frames)
+        task = bars.add_task("painting", total=options.warmup + options.frames)
         times = measure(
             avatar,
             painter,
             frames,
-            count=config.frames,
-            warmup=config.warmup,
+            count=options.frames,
+            warmup=options.warmup,
             tick=lambda: bars.advance(task),
         )
         batches = in_batches(
-            painter, frames, device, config.batch, config.frames
+            painter, frames, device, options.batch, options.frames
         )
 
     # Times in batches are a note below the table of stages.
     median = number(batches["median"])
     minimum = number(batches["minimum"])
     marks.append(
-        f"in batches of {config.batch}: {median} ms an image, at the least {minimum}"
+        f"in batches of {options.batch}: {median} ms an image, at the least {minimum}"
     )
-    settings = {"avatar": name, **settings_of(config, avatar, frames)}
+    settings = {"avatar": name, **settings_of(options, avatar, frames)}
     record = {
         "where": where,
         "settings": settings,
@@ -128,38 +160,38 @@ def run(config: DictConfig, folder: Path) -> None:
 
 
 def load_subject(
-    config: DictConfig, device: torch.device
+    options: SpeedOptions, device: torch.device
 ) -> tuple[Avatar, list[Frame], str, list[str]]:
     """An avatar in eval mode, frames of one image each on the CPU, a name, and notes for the table.
 
-    The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
+    The avatar of ``run`` with its held-out poses, or an untrained one.
     """
-    # A trained run, with its own data and config.
-    moved = DataPaths(config.data_root, config.data_smpl)
-    if config.run is not None:
+    source = options.source
+    if source.run is not None:
         # A trained run with frames of its own data.
-        folder = Path(config.run).expanduser()
-        stored = load_config(folder, moved)
-        data = build_data(stored)
-        avatar, marks = load_avatar(folder, stored, data)
+        folder = Path(source.run).expanduser()
+        stored = RunSettings.from_config(load_config(folder, source.paths))
+        data = stored.data.read()
+        avatar, marks = load_avatar(folder, stored.avatar, data)
         name = f"trained run {folder.name}"
-        frames = spread(data, config.poses)
+        frames = spread(data, options.poses)
 
-    # An untrained avatar of the command's config.
+    # An untrained avatar of the command's options.
     else:
-        moved.refuse_without_run()
-        data = build_data(config)
-        avatar = build_avatar(config, data.info, data.select_labelled("train"))
+        source.paths.refuse_without_run()
+        data = options.untrained.data.read()
+        images = data.select_labelled("train")
+        avatar = build_avatar(options.untrained.avatar, data.info, images)
         name = "untrained avatar"
         marks = [
             "untrained weights: the time of F depends on the places of its Gaussians"
         ]
         # The size can be chosen freely, so cameras are scaled to it.
-        size = (int(config.size.image), int(config.size.image))
+        size = (options.image, options.image)
         frames = []
-        for frame in spread(data, config.poses):
+        for frame in spread(data, options.poses):
             frames.append(replace(frame, camera=frame.camera.resize(size)))
-    avatar = place(avatar, device, channels_last=config.channels_last)
+    avatar = place(avatar, device, channels_last=options.channels_last)
     return avatar, frames, name, marks
 
 
@@ -352,7 +384,7 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
 
 
 def settings_of(
-    config: DictConfig, avatar: Avatar, frames: Sequence[Frame]
+    options: SpeedOptions, avatar: Avatar, frames: Sequence[Frame]
 ) -> dict[str, Any]:
     """The settings on which the times depend, by printed name."""
     # The size of an image; all frames have the same.
@@ -368,17 +400,17 @@ def settings_of(
     settings: dict[str, Any] = {
         "image": f"{width} x {height}",
         "painted": f"{pixels / (len(frames) * height * width):.0%} of its pixels",
-        "precision": config.precision,
+        "precision": options.precision,
         "memory format": "channels last"
-        if config.channels_last
+        if options.channels_last
         else "contiguous",
         "batch": 1,
-        "frames": config.frames,
+        "frames": options.frames,
     }
 
     # Settings of avatars with Gaussians.
     if avatar.splats is not None:
-        backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
+        backend, _ = resolve_backend(options.backend, device, avatar.accuracy)
         settings |= {"accuracy": avatar.accuracy.name, "backend": backend}
         settings["channels of F"] = avatar.splat_channels
         settings["supersampling of F"] = avatar.accuracy.supersample

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -18,6 +17,8 @@ from gsgan.check.sections import Measurements, sections
 from gsgan.check.settings import Limits, Sampling
 from gsgan.data.formats.capture import CaptureReader, capture_problems
 from gsgan.effects import EffectSettings
+from gsgan.utils.checks import one_of
+from gsgan.utils.config import FAILED, CommandOptions, build
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically, write_json, writing
@@ -93,38 +94,59 @@ def check_capture(root: Path, path: Path, console: Console) -> CheckReport:
     return report
 
 
-def run_check(config: DictConfig) -> CheckReport:
-    """Checks the dataset of a config, see `write_report`.
+@dataclass(frozen=True)
+class CheckOptions(CommandOptions):
+    """The options of gsgan.check: conf/check.yaml.
+
+    Args:
+        data: it need not have been read yet; or why it cannot be made.
+        report: the HTML file.
+        strict: whether a warning ends the command with 1, too.
+        sampling, limits, effects: as for `check_data`.
+    """
+
+    data: GsganData | CheckReport
+    report: str | None
+    strict: bool
+    sampling: Sampling
+    limits: Limits
+    effects: EffectSettings
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> Self:
+        """The options of a config; a dataset that cannot be made has a report, too."""
+        names = ("report", "strict", "sampling", "limits", "effects")
+        values = {name: build(config[name]) for name in names}
+        try:
+            values["data"] = build(config.data)
+        except DataError as error:
+            values["data"] = unreadable(config.data.get("root"), [str(error)])
+        return cls(**values)
+
+
+def check(options: CheckOptions) -> None:
+    """Checks a dataset, prints and writes a report; ends with 1 when something is wrong.
 
     Raises:
-        ConfigError: on a config value that does not fit.
+        ConfigError: on a value that does not fit.
     """
+    one_of("strict", options.strict, (True, False))
     # The report is the result of the command, so it must have a place.
-    if not config.report:
+    if not options.report:
         raise ConfigError(
             "report is not set: give the HTML file to write, e.g. report=check.html"
         )
     # The reader's notes are part of the report.
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
-    sampling = instantiate(config.sampling)
-    limits = instantiate(config.limits)
-    effects = instantiate(config.effects)
-    try:
+    report = options.data
+    if not isinstance(report, CheckReport):
         report = check_data(
-            instantiate(config.data),
-            sampling,
-            limits,
-            effects,
-            console,
+            report, options.sampling, options.limits, options.effects, console
         )
-    except InstantiationException as error:
-        # Hydra wraps the error of a dataset that is made when it is instantiated.
-        if not isinstance(error.__cause__, DataError):
-            raise
-        report = unreadable(config.data.get("root"), [str(error.__cause__)])
-    write_report(report, Path(config.report).expanduser(), console)
-    return report
+    write_report(report, Path(options.report).expanduser(), console)
+    if report.errors or (options.strict and report.warnings):
+        sys.exit(FAILED)
 
 
 def write_report(report: CheckReport, path: Path, console: Console) -> None:

@@ -9,7 +9,7 @@ from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
@@ -173,6 +173,12 @@ class GsganData(LightningDataModule):
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
+
+    def read(self) -> Self:
+        """Makes the dataset if need be, reads and checks it."""
+        self.prepare_data()
+        self.setup()
+        return self
 
     def prepare_data(self) -> None:
         """Makes the dataset if it has a ``source``; one process per machine."""

@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("demo", "gsgan.demo.run.demo_config")
+main = entry(
+    "demo",
+    task="gsgan.demo.run.demo",
+    options="gsgan.demo.run.DemoOptions",
+)
 
 if __name__ == "__main__":
     main()

@@ -1,19 +1,18 @@
 """Renders the avatar that comes with gsgan: a picture, and a video of a dance."""
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import cast
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 
 from gsgan.export.hub import preview
-from gsgan.render.run import render_config
+from gsgan.render.run import RenderOptions, render
 from gsgan.run.drive import MotionOptions, drive_of
 from gsgan.run.runs import Run
 from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
 from gsgan.utils.checks import whole
-from gsgan.utils.config import defaults_of
+from gsgan.utils.config import CommandOptions, with_defaults
 from gsgan.utils.console import make_console
 from gsgan.utils.files import write_atomically, writing
 
@@ -21,29 +20,38 @@ FPS = 25  # of the dance
 PICTURE = 14  # the frame that the picture shows
 
 
-def demo_config(config: DictConfig) -> None:
-    """Writes the picture and the video into the folder of a config.
+@dataclass(frozen=True)
+class DemoOptions(CommandOptions):
+    """The options of gsgan.demo: conf/demo.yaml."""
+
+    out: str
+    overwrite: bool
+    pixels: int
+    frames: int | None
+
+
+def demo(options: DemoOptions) -> None:
+    """Writes the picture and the video into the folder.
 
     Raises:
         ConfigError: when an option has an invalid value, or the video exists.
         DataError: when a file cannot be written.
     """
     # Without an encoder the video is a folder of PNG files.
-    out = Path(config.out).expanduser()
-    pixels = whole("pixels", config.pixels, 16)
+    out = Path(options.out).expanduser()
+    pixels = whole("pixels", options.pixels, 16)
     video = out / ("dance.mp4" if find_spec("av") else "dance")
     given = {
         "run": str(DEMO_FOLDER),
         "motion": str(DEMO_MOTION),
         "out": str(video),
-        "overwrite": config.overwrite,
+        "overwrite": options.overwrite,
         "fps": FPS,
-        "frames": config.frames,
+        "frames": options.frames,
         "pixels": pixels,
         "background": "white",
     }
-    settings = cast(DictConfig, OmegaConf.merge(defaults_of("render"), given))
-    render_config(settings)
+    render(RenderOptions.from_config(with_defaults("render", given)))
 
     # The picture shows one pose of the dance from the front.
     run = Run.load(DEMO_FOLDER)

@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("evaluate", "gsgan.evaluate.run.evaluate_config")
+main = entry(
+    "evaluate",
+    task="gsgan.evaluate.run.evaluate",
+    options="gsgan.evaluate.run.EvaluateOptions",
+)
 
 if __name__ == "__main__":
     main()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from typing import Any
 import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.metric_variants import MetricVariants
+from gsgan.data.protocol import Protocol
 from gsgan.data.splits import VALIDATION, Item, spread_items
 from gsgan.evaluate.distance import write_distances
 from gsgan.evaluate.files import (
@@ -52,12 +52,19 @@ from gsgan.evaluate.scores import (
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
 from gsgan.metrics.names import FLOOR_VARIANT, FULL
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.run.assemble import build_data
-from gsgan.run.runs import avatar_of, load_avatar, marks_of
+from gsgan.run.assemble import RunSettings
+from gsgan.run.runs import (
+    RunReference,
+    avatar_of,
+    avatar_settings,
+    load_avatar,
+    marks_of,
+)
 from gsgan.run.stored import (
     CHECKPOINT,
-    DataPaths,
+    Chosen,
     load_config,
+    other_capture,
     read_checkpoint,
     read_config,
 )
@@ -65,6 +72,7 @@ from gsgan.scene import Frame
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track, working
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
@@ -76,130 +84,167 @@ ALIGNED = "body poses aligned on the scored images"
 
 
 @dataclass(frozen=True)
-class ScoreOptions:
-    """What is scored and how; conf/evaluate.yaml explains the keys."""
+class ScoreOptions(CommandOptions):
+    """What is scored and how; conf/evaluate.yaml explains the keys.
 
-    lpips_nets: Sequence[str]
-    lpips_path: str | None = None
+    ``lpips`` holds the names of its networks, None for those of the run's training, and the folder
+    of their weights.
+    """
+
+    lpips: Mapping[str, Any]
     background: str | None = None
     splits: Sequence[str] = HELD_OUT_SPLITS
     score_images: int | None = None
     grid_rows: int = 4
 
-    @classmethod
-    def from_config(
-        cls, config: DictConfig, nets: Sequence[str] = LPIPS_NETS
-    ) -> ScoreOptions:
-        """The options of a config; ``nets`` are those of LPIPS if it names none."""
-        # Training has some of the keys of evaluation.
-        given = {}
-        for key in ("background", "splits", "score_images", "grid_rows"):
-            if config.get(key) is not None:
-                given[key] = config[key]
-        if config.lpips.nets is not None:
-            nets = config.lpips.nets
-        return cls(list(nets), config.lpips.path, **given)
+    @property
+    def lpips_nets(self) -> Sequence[str]:
+        """The networks of LPIPS."""
+        nets: Sequence[str] | None = self.lpips["nets"]
+        return LPIPS_NETS if nets is None else nets
+
+    def or_nets(self, nets: Sequence[str]) -> ScoreOptions:
+        """The options with these networks of LPIPS, if they name none."""
+        if self.lpips["nets"] is not None:
+            return self
+        return replace(self, lpips={**self.lpips, "nets": nets})
 
 
-def evaluate_config(config: DictConfig) -> Results:
-    """Scores ``config.run`` or ``config.predictions``.
+@dataclass(frozen=True)
+class EvaluateOptions(CommandOptions):
+    """The options of gsgan.evaluate: conf/evaluate.yaml."""
 
-    Raises:
-        ConfigError: unless exactly one of them is given, or on a value that cannot be used.
-        DataError: when the run, its data or an image of the folder cannot be used.
-    """
-    # Everything that the options alone can tell is checked first.
-    if (config.run is None) == (config.predictions is None):
-        raise ConfigError(
-            "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
-            "images> with data= and data.root="
-        )
+    source: RunReference
+    score: ScoreOptions
+    predictions: str | None
+    predictions_pattern: str
+    method: str | None
+    out: str | None
+    other_capture: str | Mapping[str, Any] | None
+    drive: str | None
+    align: str | None
+    data: GsganData | None = None
+    protocol: Protocol | None = None
 
-    # Keys of the other kind of evaluation.
-    kind = "run"
-    others = ["data", "protocol", "out", "method"]
-    if config.run is None:
-        kind = "predictions"
-        others = ["data_root", "data_smpl", "drive", "align", "other_capture"]
-    for key in others:
-        if config.get(key) is not None:
+    def __post_init__(self) -> None:
+        # Either a run or a folder of images.
+        if (self.source.run is None) == (self.predictions is None):
             raise ConfigError(
-                f"{key}= cannot be given with {kind}=; leave it out"
+                "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
+                "images> with data= and data.root="
             )
 
-    # Another capture is named by `other_capture` alone.
-    if config.get("other_capture") is not None and config.data_root is not None:
-        raise ConfigError(
-            "data_root= cannot be given with other_capture=; leave it out"
-        )
+        # Keys of the other kind of evaluation.
+        kind = "run"
+        others: dict[str, Any] = {
+            "data": self.data,
+            "protocol": self.protocol,
+            "out": self.out,
+            "method": self.method,
+        }
+        if self.source.run is None:
+            kind = "predictions"
+            others = {
+                "data_root": self.source.data_root,
+                "data_smpl": self.source.data_smpl,
+                "drive": self.drive,
+                "align": self.align,
+                "other_capture": self.other_capture,
+            }
+        for key, value in others.items():
+            if value is not None:
+                raise ConfigError(
+                    f"{key}= cannot be given with {kind}=; leave it out"
+                )
 
-    # Values.
-    if config.background not in (None, *BACKGROUNDS):
-        raise ConfigError(
-            f"background must be black, white or null; got {config.background!r}"
-        )
-    if config.get("drive") not in (None, "skeleton"):
-        raise ConfigError(
-            f"drive must be skeleton or null; got {config.drive!r}"
-        )
-    if config.get("align") not in (None, "pose"):
-        raise ConfigError(f"align must be pose or null; got {config.align!r}")
-    if not config.splits or not set(config.splits) <= set(HELD_OUT_SPLITS):
-        raise ConfigError(
-            f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {config.splits}"
-        )
+        # Another capture is named by `other_capture` alone.
+        if self.other_capture is not None and self.source.data_root is not None:
+            raise ConfigError(
+                "data_root= cannot be given with other_capture=; leave it out"
+            )
 
-    score = evaluate_predictions if config.run is None else evaluate_folder
-    return score(config, make_console(), pick_device(config.device))
+        # Values.
+        score = self.score
+        if score.background not in (None, *BACKGROUNDS):
+            raise ConfigError(
+                f"background must be black, white or null; got {score.background!r}"
+            )
+        if self.drive not in (None, "skeleton"):
+            raise ConfigError(
+                f"drive must be skeleton or null; got {self.drive!r}"
+            )
+        if self.align not in (None, "pose"):
+            raise ConfigError(f"align must be pose or null; got {self.align!r}")
+        if not score.splits or not set(score.splits) <= set(HELD_OUT_SPLITS):
+            raise ConfigError(
+                f"splits must be a list of {' and '.join(HELD_OUT_SPLITS)}; got {score.splits}"
+            )
+
+
+def evaluate(options: EvaluateOptions) -> Results:
+    """Scores a run, or a folder of predictions.
+
+    Raises:
+        ConfigError: on a value that cannot be used.
+        DataError: when the run, its data or an image of the folder cannot be used.
+    """
+    score = evaluate_predictions
+    if options.source.run is not None:
+        score = evaluate_folder
+    return score(options, make_console(), pick_device(options.source.device))
 
 
 def evaluate_folder(
-    config: DictConfig, console: Console, device: torch.device
+    options: EvaluateOptions, console: Console, device: torch.device
 ) -> Results:
-    """Loads the avatar of ``config.run`` and scores it."""
+    """Loads the avatar of a run and scores it."""
     # By default the networks of LPIPS that the run was configured with.
-    folder = Path(config.run).expanduser()
+    assert options.source.run is not None
+    folder = Path(options.source.run).expanduser()
     stored = read_config(folder)
-    own = OmegaConf.select(stored, "lpips.nets", default=LPIPS_NETS)
-    options = ScoreOptions.from_config(config, own)
+    nets = OmegaConf.select(stored, "lpips.nets", default=LPIPS_NETS)
+    score = options.score.or_nets(list(nets))
 
     # The weights, and the number of steps, the time and the code that made them.
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     state = checkpoint["gsgan"]
 
     # The avatar, on its own data or on another capture, whose poses are of another body.
-    other = config.get("other_capture") is not None
+    other = options.other_capture is not None
     out = folder
-    if other:
+    if options.other_capture is not None:
         with working(console, "building the avatar"):
-            avatar = avatar_of(folder, stored, checkpoint, config.data_smpl)
+            settings = avatar_settings(folder, stored)
+            smpl = options.source.data_smpl
+            avatar = avatar_of(folder, settings, checkpoint, smpl)
         with working(console, "reading the data"):
-            data = build_data(other_capture(stored, config.other_capture))
+            moved = other_capture(folder, options.other_capture)
+            data = RunSettings.from_config(moved).data.read()
         name = Path(data.layout.root).resolve().name
         out = folder / "on" / name
         marks = [*marks_of(state), f"on another capture: {name}", BY_SKELETON]
     else:
-        stored = load_config(folder, DataPaths.from_config(config))
+        run = RunSettings.from_config(load_config(folder, options.source.paths))
         with working(console, "reading the data"):
-            data = build_data(stored)
+            data = run.data.read()
         with working(console, "building the avatar"):
-            avatar, marks = load_avatar(folder, stored, data)
-        marks = [*marks, *choice_marks(stored, data)]
+            avatar, marks = load_avatar(folder, run.avatar, data)
+        marks = [*marks, *choice_marks(Chosen.of(stored), data)]
 
     # Scores of other settings have folders of their own, so that the protocol's scores stay.
-    if config.background not in (None, _measures(data).background):
-        out = out / f"on_{config.background}"
-    if config.drive is not None and not other:
+    if score.background not in (None, _measures(data).background):
+        out = out / f"on_{score.background}"
+    if options.drive is not None and not other:
         out = out / "by_skeleton"
         marks = [*marks, BY_SKELETON]
-    align = config.align is not None
+    align = options.align is not None
     if align:
         out = out / "aligned"
         marks = [*marks, ALIGNED]
-    if len(set(config.splits)) < len(HELD_OUT_SPLITS):
-        out = out / config.splits[0]
-    if images_scored(out) > (options.score_images or math.inf):
-        out = out / f"of_{options.score_images}_images"
+    if len(set(score.splits)) < len(HELD_OUT_SPLITS):
+        out = out / score.splits[0]
+    if images_scored(out) > (score.score_images or math.inf):
+        out = out / f"of_{score.score_images}_images"
 
     # What facts.json states about the run.
     method = read_method(
@@ -211,10 +256,10 @@ def evaluate_folder(
     )
 
     # Poses are solved from skeletons on request; another capture has other cameras' colours.
-    solve = config.drive is not None
+    solve = options.drive is not None
     return evaluate_method(
         out,
-        options,
+        score,
         console,
         data,
         predict=painter(
@@ -228,101 +273,74 @@ def evaluate_folder(
     )
 
 
-def choice_marks(config: DictConfig, data: GsganData) -> list[str]:
-    """Notes that held-out images have chosen something about a run of this config, so that its
-    scores on them are no test of it."""
+def choice_marks(chosen: Chosen, data: GsganData) -> list[str]:
+    """Notes that held-out images have chosen something about a run, so that its scores on them are
+    no test of it."""
     marks = []
     if data.watched[0] in HELD_OUT_SPLITS:
-        for name, settings in (config.get("callbacks") or {}).items():
+        for name, settings in chosen.callbacks.items():
             if str(settings.get("monitor")).startswith("val/"):
                 marks.append(f"callbacks.{name} watched held-out images")
-    objective = config.get("objective")
+    objective = chosen.objective
     if objective is not None and objective.split(".")[0] in HELD_OUT_SPLITS:
         marks.append(f"a search compared runs by objective={objective}")
     return marks
 
 
-def other_capture(stored: DictConfig, given: str | DictConfig) -> DictConfig:
-    """A run's config with the data of another capture: its folder, or the keys that differ.
-
-    Body poses are left out, as they are of another body, and so are the run's splits.
-
-    Raises:
-        ConfigError: on a key that the run's data lacks.
-    """
-    config = stored.copy()
-
-    # The run's own data, splits and protocol do not hold for another capture.
-    cameras = ("train_cameras", "test_cameras")
-    splits = (*cameras, "train_frames", "test_frames", "train_poses")
-    own = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
-    config.data.merge_with(own)
-
-    # Only keys that the data has can be changed.
-    OmegaConf.set_struct(config, True)
-    try:
-        config.data.merge_with(
-            {"root": given} if isinstance(given, str) else given
-        )
-    except ConfigKeyError as error:
-        raise ConfigError(
-            f"other_capture: {str(error).splitlines()[0]} of the run's data"
-        ) from None
-    return config
-
-
 def evaluate_predictions(
-    config: DictConfig, console: Console, device: torch.device
+    options: EvaluateOptions, console: Console, device: torch.device
 ) -> Results:
-    """Scores the folder ``config.predictions`` on the config's data."""
-    if config.get("data") is None:
+    """Scores a folder of predictions on the options' data."""
+    if options.data is None:
         raise ConfigError(
             "data is not set: give that of the predictions with data= and data.root="
         )
 
     # Without a name, the folder's name is that of the method.
-    root = Path(config.predictions).expanduser()
-    name = config.method or root.resolve().name
+    root = Path(str(options.predictions)).expanduser()
+    name = options.method or root.resolve().name
 
     # The data, and a folder for the results that holds no others.
     with working(console, "reading the data"):
-        data = build_data(config)
-    out = _out(config, root.resolve(), name)
+        data = options.data.read()
+    out = _out(options.out, root.resolve(), name)
 
     # The images must have the size of the ground truth.
     sizes = {}
-    for split in config.splits:
-        own = data.dataset(split)
-        sizes[split] = {item: own.camera(item).size for item in own.items}
+    for split in options.score.splits:
+        dataset = data.dataset(split)
+        sizes[split] = {
+            item: dataset.camera(item).size for item in dataset.items
+        }
     folder = read_folder(
         root,
-        config.predictions_pattern,
+        options.predictions_pattern,
         sizes,
         data.layout.camera_names,
-        config.background or _measures(data).background,
+        options.score.background or _measures(data).background,
     )
 
     # The choice of the config group data, if a command made one.
-    chosen = None
+    data_choice = None
     if HydraConfig.initialized():
-        chosen = HydraConfig.get().runtime.choices.get("data")
+        data_choice = HydraConfig.get().runtime.choices.get("data")
     return evaluate_method(
         out,
-        ScoreOptions.from_config(config),
+        options.score,
         console,
         data,
         predict=folder.predict,
-        method=Method(name, data=chosen),
+        method=Method(name, data=data_choice),
         device=device,
     )
 
 
-def _out(config: DictConfig, root: Path, method: str) -> Path:
+def _out(requested: str | None, root: Path, method: str) -> Path:
     """The folder for scores; refuses one inside the predictions, a run, or one with the scores of
     another method."""
     out = root.with_name(f"{root.name}_scores")
-    if config.out is not None:
-        out = Path(config.out).expanduser().resolve()
+    if requested is not None:
+        out = Path(requested).expanduser().resolve()
     if (
         root in (out, *out.parents)
         or out.is_file()
@@ -578,7 +596,7 @@ def make_scorer(
             data.skeleton,
             data.layout.meta.label_names or (),
         ),
-        lpips=build_lpips(options.lpips_nets, options.lpips_path),
+        lpips=build_lpips(options.lpips_nets, options.lpips["path"]),
         marks=marks,
         protocol=record,
     )

@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("export", "gsgan.export.run.export_config")
+main = entry(
+    "export",
+    task="gsgan.export.run.export",
+    options="gsgan.export.run.ExportOptions",
+)
 
 if __name__ == "__main__":
     main()

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
 
 from gsgan import __version__
 from gsgan.metrics.names import FLOOR_VARIANT, FULL, VARIANTS
@@ -77,7 +76,7 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
     """
     facts = _read(run.folder / "facts.json")
     data = facts.get("data", {})
-    free = _is_free(run.stored)
+    free = run.trained_as.character in FREE_PERSONS
 
     # The card's header is read by hubs such as Hugging Face.
     head: dict[str, Any] = {
@@ -94,11 +93,11 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
     about = {
         "data": " ".join(str(value) for value in identity if value),
         "training cameras": run.scene.n_train_cameras,
-        "image size": run.stored.data.size,
+        "image size": run.trained_as.image_size,
         "protocol": facts.get("protocol") or "none",
         "model": facts.get("model"),
         "iterations": run.checkpoint["step"],
-        "seed": run.stored.get("seed"),
+        "seed": run.trained_as.seed,
         "gsgan": facts.get("version", __version__),
         "commit": facts.get("commit"),
     }
@@ -121,11 +120,6 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         "## Licence\n\n" + (licence or _licence(free)),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _is_free(config: DictConfig) -> bool:
-    """Whether a run's person is one of gsgan's own characters."""
-    return OmegaConf.select(config, "data.source.avatar") in FREE_PERSONS
 
 
 def _licence(free: bool) -> str:

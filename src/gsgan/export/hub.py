@@ -46,7 +46,7 @@ def preview(run: Run, drive: Drive, size: int) -> bytes:
         drive: the motion.
         size: pixels of the square image.
     """
-    trained = run.stored.data.size or size
+    trained = run.trained_as.image_size or size
     camera = Orbit().cameras(
         drive.p[:1], run.proportions, run.scene, size=size, trained=trained
     )

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from gsgan.model.avatar import Avatar
+from gsgan.model.generator import Generator
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
@@ -132,6 +133,7 @@ class PoseAndGenerator(nn.Module):
         self.splats = avatar.splat_channels > 0
         self.template = avatar.template
         self.pose_encoder = avatar.pose_encoder
+        assert isinstance(avatar.generator, Generator)
         self.generator = avatar.generator
 
         # Images that the avatar does not render have no channels.

@@ -1,12 +1,11 @@
 """Writes the export that a config describes."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from rich.console import Console
 
 from gsgan.export.card import card
@@ -43,9 +42,10 @@ from gsgan.run.drive import (
     drive_of,
     inputs_of,
 )
-from gsgan.run.runs import Run
+from gsgan.run.runs import Run, RunReference
 from gsgan.scene import BodyPose, cat
 from gsgan.utils.checks import above, one_of, whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically, writing
@@ -72,8 +72,32 @@ CARD = "MODEL_CARD.md"
 PREVIEW_SIZE = 512  # pixels, of runs whose images have sizes of their own
 
 
-def export_config(config: DictConfig) -> None:
-    """Writes the export that a config describes, and a model card beside it.
+@dataclass(frozen=True)
+class ExportOptions(CommandOptions):
+    """The options of gsgan.export: conf/export.yaml."""
+
+    source: RunReference
+    driven: MotionOptions
+    capture: str | None
+    format: str
+    out: str | None
+    overwrite: bool
+    start: int
+    frames: int | None
+    fps: float
+    pixels: int | None
+    upload: str | None
+    private: bool
+    licence: str | None
+    verify: str | None
+
+    def run(self) -> Run:
+        """The run, on the CPU: programs that are made there name no device."""
+        return replace(self.source, device="cpu").load()
+
+
+def export(options: ExportOptions) -> None:
+    """Writes an export, and a model card beside it.
 
     Raises:
         ConfigError: when an option has an invalid value, or the output exists.
@@ -85,8 +109,8 @@ def export_config(config: DictConfig) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     # With `verify` nothing is exported: a file is read for its marks.
-    if config.verify is not None:
-        path = Path(config.verify).expanduser()
+    if options.verify is not None:
+        path = Path(options.verify).expanduser()
         problem = verify(path)
         state = (
             "marked as synthetic"
@@ -97,44 +121,43 @@ def export_config(config: DictConfig) -> None:
         tell(problem.summary())
         return
 
-    # Options are checked before the run is loaded. Programs are made on the CPU, so
-    # that they name no device.
-    kind = one_of("format", config.format, tuple(ENDINGS))
-    out = _place(config, kind)
+    # Options are checked before the run is loaded.
+    kind = one_of("format", options.format, tuple(ENDINGS))
+    out = _place(options, kind)
     sequence = kind == "ply" and not out.suffix
     beside = _card_of(out, sequence)
-    if beside.exists() and not config.overwrite:
+    if beside.exists() and not options.overwrite:
         raise ConfigError(
             f"{beside} exists; give overwrite=true or another name"
         )
-    _check_upload(config, kind)
+    _check_upload(options, kind)
     if kind == "usd":
         refuse_missing_usd()
     if kind in MOTIONS:
-        motion = _motion(config, console)
+        motion = _motion(options, console)
         _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
         tell(
             f"written: {out}, {len(motion.poses.theta)} frames at {motion.fps:g}"
         )
         return
-    run = Run.from_config(config, device="cpu")
+    run = options.run()
     if kind == "hub":
-        _hub(config, run, out, tell)
+        _hub(options, run, out, tell)
         return
 
     if kind in ("ply", "splat", "spz", "gltf", "usd"):
-        _write_poses(config, run, out, console)
+        _write_poses(options, run, out, console)
 
     # A page, or its content for a page of the user's own.
     elif kind in ("html", "bin"):
         title = out.name.split(".")[0]
-        content = _block(config, run, title, tell)
+        content = _block(options, run, title, tell)
         _write(out, content if kind == "bin" else page(content, title))
     else:
-        _write(out, _program(config, run, kind))
+        _write(out, _program(options, run, kind))
 
     # The model card lies beside the file, or in the folder of a sequence.
-    _write(beside, card(run, kind, out.name, config.licence))
+    _write(beside, card(run, kind, out.name, options.licence))
     tell(f"written: {out}, {beside.name}")
 
 
@@ -144,21 +167,21 @@ def _write(path: Path, content: str | bytes) -> None:
 
 
 def _write_poses(
-    config: DictConfig, run: Run, out: Path, console: Console
+    options: ExportOptions, run: Run, out: Path, console: Console
 ) -> None:
     """Writes Gaussians in one pose per file: one file, or a sequence of .ply files in a folder. A
     .usdc file has all poses of a motion."""
     # Without a motion a scene's file shows the rest pose.
-    kind = config.format
-    options = MotionOptions.from_config(config)
-    if options.motion is None and kind in ("gltf", "usd"):
-        options = replace(options, motion=REST)
-    drive = _poses(options, config, run)
+    kind = options.format
+    motion = options.driven
+    if motion.motion is None and kind in ("gltf", "usd"):
+        motion = replace(motion, motion=REST)
+    drive = _poses(motion, options, run)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     frames = track(range(len(drive.p)), "writing", console)
     if kind == "usd":
         poses = (_pose_frame(run, drive, i) for i in frames)
-        fps = float(config.fps)
+        fps = float(options.fps)
         _write(out, usd_bytes(poses, fps, run.proportions.up))
         return
     if out.suffix:
@@ -183,10 +206,10 @@ def _card_of(out: Path, sequence: bool) -> Path:
     return out / CARD if sequence else out.with_name(f"{out.name}.{CARD}")
 
 
-def _place(config: DictConfig, kind: str) -> Path:
+def _place(options: ExportOptions, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
     # A capture has motion, but no avatar.
-    if config.capture is not None and kind not in MOTIONS:
+    if options.capture is not None and kind not in MOTIONS:
         raise ConfigError(
             f"capture: format={kind} needs run=<folder>; a capture gives {', '.join(MOTIONS)}"
         )
@@ -195,9 +218,9 @@ def _place(config: DictConfig, kind: str) -> Path:
     ending = ENDINGS[kind]
     places = {"ply": "a .ply file or a folder", "hub": "a folder"}
     place = places.get(kind, f"a {ending} file")
-    if config.out is None:
+    if options.out is None:
         raise ConfigError(f"out is not set: format={kind} needs {place}")
-    out = Path(config.out).expanduser()
+    out = Path(options.out).expanduser()
     folder = kind == "hub" or (kind == "ply" and not out.suffix)
     if not folder and out.suffix.lower() != ending:
         raise ConfigError(f"out={out}: format={kind} needs {place}")
@@ -212,7 +235,7 @@ def _place(config: DictConfig, kind: str) -> Path:
         raise ConfigError(f"out={out} is {found}")
     if (
         out.exists()
-        and not config.overwrite
+        and not options.overwrite
         and (not folder or any(out.iterdir()))
     ):
         raise ConfigError(
@@ -221,96 +244,97 @@ def _place(config: DictConfig, kind: str) -> Path:
     return out
 
 
-def _check_upload(config: DictConfig, kind: str) -> None:
+def _check_upload(options: ExportOptions, kind: str) -> None:
     """Refuses options of an upload that cannot be met, before anything is computed."""
-    if config.upload is None:
-        if config.private:
+    if options.upload is None:
+        if options.private:
             raise ConfigError("private=true requires upload=<owner/name>")
         return
     if kind != "hub":
         raise ConfigError("upload requires format=hub")
-    refuse_missing_hub(config.upload)
+    refuse_missing_hub(options.upload)
 
 
 def _hub(
-    config: DictConfig, run: Run, out: Path, tell: Callable[[str], None]
+    options: ExportOptions, run: Run, out: Path, tell: Callable[[str], None]
 ) -> None:
     """Writes the folder of a shared avatar, and uploads it if the user asks for it."""
     # The preview shows the first pose of the motion; the rest pose needs no dataset.
-    options = MotionOptions.from_config(config)
-    if options.motion is None:
-        options = replace(options, motion=REST)
-    drive = _poses(options, config, run)
+    motion = options.driven
+    if motion.motion is None:
+        motion = replace(motion, motion=REST)
+    drive = _poses(motion, options, run)
     tell(drive.text)
-    name = config.upload or out.name
+    name = options.upload or out.name
     files = avatar_files(run)
-    files[CARD_FILE] = card(run, "hub", name, config.licence).encode()
-    files[PREVIEW] = preview(run, drive, run.stored.data.size or PREVIEW_SIZE)
+    files[CARD_FILE] = card(run, "hub", name, options.licence).encode()
+    files[PREVIEW] = preview(
+        run, drive, run.trained_as.image_size or PREVIEW_SIZE
+    )
     for file, content in files.items():
         _write(out / file, content)
     tell(f"written: {out}, {', '.join(files)}")
-    if config.upload is not None:
-        address = upload(files, config.upload, bool(config.private))
+    if options.upload is not None:
+        address = upload(files, options.upload, bool(options.private))
         tell(f"uploaded: {address}")
 
 
 def _block(
-    config: DictConfig,
+    options: ExportOptions,
     run: Run,
     name: str,
     tell: Callable[[str], None],
 ) -> bytes:
     """The content of a .bin file, and of a page; each motion is one of its own."""
     refuse_unsuitable(run.avatar)
-    options = MotionOptions.from_config(config)
-    chosen = options.motion or []
+    chosen = options.driven.motion or []
     if isinstance(chosen, str):
         chosen = [chosen]
 
     # Motions are named by their files.
     motions = {}
     for motion in chosen:
-        drive = _poses(replace(options, motion=motion), config, run)
+        drive = _poses(replace(options.driven, motion=motion), options, run)
         tell(drive.text)
-        motions[Path(motion).stem] = drive, float(config.fps)
-    return block(run, distil_run(options, run), motions, name)
+        motions[Path(motion).stem] = drive, float(options.fps)
+    return block(run, distil_run(options.driven, run), motions, name)
 
 
-def _poses(options: MotionOptions, config: DictConfig, run: Run) -> Drive:
+def _poses(motion: MotionOptions, options: ExportOptions, run: Run) -> Drive:
     """The frames to export; by default a held-out one."""
     # The whole motion; its length is known only now.
-    drive = drive_of(options, run, float(above("fps", config.fps)))
+    drive = drive_of(motion, run, float(above("fps", options.fps)))
 
     # Some of its frames, if the user asks for them.
-    start = whole("start", config.start, 0)
+    start = whole("start", options.start, 0)
     if start >= len(drive.p):
         raise ConfigError(
             f"start={start}: the motion has {len(drive.p)} frames"
         )
     end = (
         None
-        if config.frames is None
-        else start + whole("frames", config.frames, 1)
+        if options.frames is None
+        else start + whole("frames", options.frames, 1)
     )
     return drive.rows(np.arange(len(drive.p))[start:end])
 
 
 @torch.no_grad()
-def _motion(config: DictConfig, console: Console) -> BodyMotion:
+def _motion(options: ExportOptions, console: Console) -> BodyMotion:
     """The body poses of a capture, or of the motion that drives a run."""
-    fps = float(above("fps", config.fps))
-    if config.capture is not None:
-        capture = Path(config.capture).expanduser()
-        return read_captured(capture, config.data_smpl, fps)
+    fps = float(above("fps", options.fps))
+    if options.capture is not None:
+        capture = Path(options.capture).expanduser()
+        return read_captured(capture, options.source.data_smpl, fps)
 
     # The body that the avatar moves with, whose poses are those of the motion or solved.
-    run = Run.from_config(config, device="cpu")
+    run = options.run()
     body = run.body
     if body is None:
         raise ConfigError(
             f"run={run.folder}: its avatar moves without a body; give capture=<folder>"
         )
-    drive = _poses(MotionOptions.from_config(config), config, run)
+    drive = _poses(options.driven, options, run)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     poses = []
     for i in track(range(len(drive.p)), "posing", console):
@@ -340,7 +364,7 @@ def _splats(run: Run, drive: Drive, i: int, kind: str) -> bytes:
     return ply_bytes(splats, run.avatar.accuracy.antialias)
 
 
-def _program(config: DictConfig, run: Run, kind: str) -> bytes:
+def _program(options: ExportOptions, run: Run, kind: str) -> bytes:
     """The content of a .onnx, .pt2 or .safetensors file."""
     if kind == "safetensors":
         return safetensors_file(run)
@@ -349,5 +373,7 @@ def _program(config: DictConfig, run: Run, kind: str) -> bytes:
     # The other formats need the exporters of torch, which take long to import.
     if kind == "onnx":
         return onnx_program(run.avatar)
-    side = whole("pixels", config.pixels or run.stored.data.size or 512, 1)
+    side = whole(
+        "pixels", options.pixels or run.trained_as.image_size or 512, 1
+    )
     return torch_program(run.avatar, (side, side))

@@ -9,11 +9,13 @@ from omegaconf import OmegaConf
 from safetensors.torch import save
 
 from gsgan.model.avatar import Avatar
+from gsgan.run.assemble import AvatarSettings
 from gsgan.run.runs import Run, avatar_of, marks_of
 from gsgan.run.shared import (
     ENTRIES,
     FACTS,
     check_config,
+    own_config,
     read_weights,
     refusing_damage,
 )
@@ -28,7 +30,7 @@ def facts_of(run: Run) -> dict[str, Any]:
     Raises:
         DataError: when the config names a class that is not one of gsgan's own configs.
     """
-    config = check_config(run.folder, run.stored)
+    config = own_config(run.folder)
     # The scene as plain values, with the fields that this version reads.
     facts = run.checkpoint | {"scene": asdict(run.scene)}
     return {
@@ -80,5 +82,6 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
             "gsgan": json.loads(metadata["gsgan"]),
             "state_dict": state,
         }
-        avatar = avatar_of(path, config, checkpoint)
+        settings = AvatarSettings.from_config(config)
+        avatar = avatar_of(path, settings, checkpoint)
     return avatar.to(pick_device(device))

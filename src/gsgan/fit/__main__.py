@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("fit", "gsgan.fit.run.run_fit")
+main = entry(
+    "fit",
+    task="gsgan.fit.run.run_fit",
+    options="gsgan.fit.run.FitOptions",
+)
 
 if __name__ == "__main__":
     main()

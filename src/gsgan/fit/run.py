@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from filelock import FileLock
-from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor
 
@@ -37,6 +35,7 @@ from gsgan.fit.report import REPORT, fit_report, summary
 from gsgan.fit.shape import fit_hands, fit_offsets, fit_shape
 from gsgan.scene import BodyPose, cat
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, progress, working
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import (
@@ -55,8 +54,20 @@ LOCK = ".body_fit.lock"
 FRAMES_AT_ONCE = 500
 
 
-def run_fit(config: DictConfig) -> Path:
-    """Fits the body to ``config.data`` and writes it into ``config.out``, or into the capture.
+@dataclass(frozen=True)
+class FitOptions(CommandOptions):
+    """The options of gsgan.fit: conf/fit.yaml."""
+
+    data: GsganData
+    fit: Fit
+    out: str | None
+    overwrite: bool
+    seed: int
+    device: str
+
+
+def run_fit(options: FitOptions) -> Path:
+    """Fits the body to a dataset and writes it into ``out``, or into the capture.
 
     Returns:
         The folder of the written files.
@@ -64,12 +75,14 @@ def run_fit(config: DictConfig) -> Path:
     Raises:
         ConfigError, DataError: on anything the user can correct.
     """
-    # The parts of the config, and the folder of the results.
-    settings: Fit = instantiate(config.fit)
-    data: GsganData = instantiate(config.data, _convert_="all")
-    device = pick_device(config.device)
-    out = None if config.out is None else str(config.out)
-    return fit_body(data, settings, out, config.seed, device, config.overwrite)
+    return fit_body(
+        options.data,
+        options.fit,
+        None if options.out is None else str(options.out),
+        options.seed,
+        pick_device(options.device),
+        options.overwrite,
+    )
 
 
 def fit_before_training(

@@ -1,6 +1,7 @@
 """L_perc: distance between features of a pretrained network, in the whole image or in crops."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -147,6 +148,24 @@ class Perceptual(nn.Module):
         # Weights are the inverse means, scaled to a sum of 1.
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
         return (loss * inverse / inverse.sum()).sum()
+
+
+@dataclass(frozen=True)
+class PerceptualSettings:
+    """Settings of `Perceptual`: the key ``training.perceptual``."""
+
+    weights: str
+    net: str
+    form: str
+    path: str | None
+    crop: int | None
+    crops: int
+    warmup: int
+    width: int
+
+    def build(self) -> Perceptual:
+        """The loss, with its network."""
+        return Perceptual(**vars(self))
 
 
 def crop_person(

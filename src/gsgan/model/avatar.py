@@ -15,7 +15,7 @@ from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
-from gsgan.model.generator import Generator
+from gsgan.model.generator import ImageGenerator
 from gsgan.model.painted import find_window
 from gsgan.model.pose_graph import pose_inputs
 from gsgan.model.rendering import Rendering
@@ -173,7 +173,7 @@ class Avatar(nn.Module):
         segmentation: Segmentation | None = None,
         segmentation_why: str = "",
         pose_encoder: nn.Module | None = None,
-        generator: Generator | None = None,
+        generator: ImageGenerator | None = None,
         colour: ColourCorrection | None = None,
         solver: Solver | None = None,
         poses: TrainingPoses | None = None,
@@ -523,16 +523,16 @@ class Avatar(nn.Module):
             g = self.pose_encoder(*inputs.pose)
         with self.stage("UNet"):
             # image_to_image: the drawing stands in F's place
-            maps = {"F": inputs.drawn, "p2d": None}
-            if raster is not None:
-                maps = {
-                    "F": raster.features,
-                    "fine": raster.fine,
-                    "alpha": raster.alpha,
-                    "p2d": inputs.drawn,
-                }
-            generated: Tensor = self.generator(S=inputs.S, g=g, **maps)
-        return generated
+            if raster is None:
+                return self.generator(F=inputs.drawn, S=inputs.S, p2d=None, g=g)
+            return self.generator(
+                F=raster.features,
+                S=inputs.S,
+                p2d=inputs.drawn,
+                g=g,
+                fine=raster.fine,
+                alpha=raster.alpha,
+            )
 
     def _find_window(self, raster: Raster) -> Window | None:
         """The part of the images that the generator paints; None means all.
@@ -588,7 +588,7 @@ class Avatar(nn.Module):
             return None
 
         # The bound of the features is the generator's, so there is none without a generator.
-        bound = getattr(self.generator, "feature_bound", None)
+        bound = None if self.generator is None else self.generator.feature_bound
         if bound is None:
             return gaussians  # type: ignore[no-any-return]
         return replace(

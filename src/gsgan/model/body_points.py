@@ -1,7 +1,7 @@
 """Canonical points and Gaussians on a skinned body, moved by linear blend skinning (LBS)."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
@@ -540,6 +540,29 @@ class BodyPoints(nn.Module):
             A if jacobian is None else jacobian, self.rest_normals
         )
         return means, A, t, jacobian, normals
+
+
+@dataclass(frozen=True)
+class BodyPointsSettings:
+    """Settings of `BodyPoints`: conf/model/full.yaml."""
+
+    points: int | str | None
+    spacing: float
+    sigma: float
+    mean_step: float
+    scale_spacings: float | None
+    controls: int
+    pose_offsets: float
+    rate: float
+    stretch: bool
+    stretch_limit: float | None
+    stretch_every: int
+
+    def build(
+        self, body: SkinnedBody, stature: float, scale: float
+    ) -> BodyPoints:
+        """The points on a person's body; scale: pixels per metre in training images."""
+        return BodyPoints(body, stature, scale=scale, **vars(self))
 
 
 def points_for(stature: float, scale: float, spacing: float) -> int:

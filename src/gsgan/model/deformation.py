@@ -1,7 +1,7 @@
 """Ψ: the pose-guided deformation of fixed Gaussians G into Ĝ (paper Sec. 3.3)."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,7 +12,11 @@ from torch.nn import functional
 
 from gsgan.model.interpolation import Interpolation
 from gsgan.model.light import LIGHT_RATE, SharedLight
-from gsgan.model.residual_gaussians import ResidualGaussians, Residuals
+from gsgan.model.residual_gaussians import (
+    PlacedPoints,
+    ResidualGaussians,
+    Residuals,
+)
 from gsgan.skeleton import Points
 from gsgan.skeleton.densify import rows_of
 from gsgan.splat.sh import brighten
@@ -352,6 +356,45 @@ class Deformation(ResidualGaussians):
             known, self.embedding.expand(*size, -1), weight, bias, *layers
         )
         return x
+
+
+@dataclass(frozen=True)
+class DeformationSettings:
+    """Settings of `Deformation`: conf/model/deformation/psi.yaml."""
+
+    width: int
+    layers: int
+    embedding: int
+    anchors: int | None
+    features: int
+    rest_octaves: int
+    position_octaves: int
+    normals: bool | None
+    free_table: bool
+    pose_limit: float | None
+    opacity: float
+    mean_bound: float | None
+    scale_min: float
+    scale_max: float
+    logit_bound: float
+
+    def build(self, placed: PlacedPoints) -> Deformation:
+        """Ψ for the points of a scene."""
+        # One camera does not see how what is turned away from it is lit.
+        normals = self.normals
+        if normals is None:
+            normals = placed.cameras > 1
+        scale_max = placed.scale_max or self.scale_max
+        settings = vars(self) | {"normals": normals, "scale_max": scale_max}
+        return Deformation(
+            placed.rest_points,
+            placed.stature,
+            placed.joints,
+            sh_degree=placed.sh_degree,
+            mean_step=placed.mean_step,
+            light=placed.light,
+            **settings,
+        )
 
 
 def positional_encoding(x: Tensor, octaves: int) -> Tensor:

@@ -1,5 +1,7 @@
 """The multi-scale patch discriminator, whose features also serve L_feat (paper Sec. 3.5)."""
 
+from dataclasses import dataclass
+
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -124,3 +126,17 @@ class Discriminator(nn.Module):
                 image, 3, stride=2, padding=1, count_include_pad=False
             )
         return results
+
+
+@dataclass(frozen=True)
+class DiscriminatorSettings:
+    """Settings of `Discriminator`: the key ``training.discriminator``."""
+
+    scales: int
+    base: int
+    layers: int
+    norm: str
+
+    def build(self) -> Discriminator:
+        """The discriminator, with new weights."""
+        return Discriminator(**vars(self))

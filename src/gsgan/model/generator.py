@@ -1,8 +1,10 @@
 """The generator: a UNet with two encoders, modulated by the pose (paper Sec. 3.5)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +16,7 @@ from gsgan.utils.tensors import derive, full_precision
 # inside the root: an all-zero pixel (empty background) stays zero
 NORM_FLOOR = 1e-6
 SLOPE = 0.2
+AUTO = "auto"
 MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 
 
@@ -177,6 +180,57 @@ class Refinement(nn.Module):
         return _activate(self.conv(_activate(fine)))
 
 
+class Channels(NamedTuple):
+    """The inputs of a generator.
+
+    Args:
+        feature: channels of F, colour included.
+        segmentation: channels of S; 0 leaves S out (``wo_seg``).
+        skeleton: channels of p₂D; 0: it takes F's place (``image_to_image``).
+        pose: length of g.
+        supersample: F is rendered this many times larger each way.
+        dense: Gaussians on the body are as many as pixels, which a last level would not sharpen.
+    """
+
+    feature: int
+    segmentation: int
+    skeleton: int
+    pose: int
+    supersample: int
+    dense: bool
+
+
+class ImageGenerator(Protocol):
+    """What an avatar needs of a generator: a module that paints an image and its alpha.
+
+    Args:
+        feature_bound: F's Gaussians are clamped to this range; None: they are not.
+    """
+
+    feature_bound: float | None
+
+    def __call__(
+        self,
+        F: Tensor,
+        S: Tensor | None,
+        p2d: Tensor | None,
+        g: Tensor,
+        fine: Tensor | None = None,
+        alpha: Tensor | None = None,
+    ) -> Tensor:
+        """``[B, 4, H, W]``: see `Generator.forward`."""
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """The weights, as of every module."""
+
+
+class GeneratorFactory(Protocol):
+    """The config group ``model/generator``, which builds a generator."""
+
+    def build(self, channels: Channels) -> ImageGenerator:
+        """The generator of a scene's maps."""
+
+
 class Generator(nn.Module):
     """F ⊕ S ⊕ p₂D and g to the image and its alpha.
 
@@ -240,7 +294,7 @@ class Generator(nn.Module):
         if supersample > 1:
             inputs += feature_channels * supersample**2
         self.rgb_skip = rgb_skip
-        self.feature_bound = feature_bound
+        self.feature_bound: float | None = feature_bound
         self.content = Encoder(inputs, channels, patch)
         self.style = Encoder(feature_channels, widths, patch)
 
@@ -381,6 +435,31 @@ class Generator(nn.Module):
         if height % stride or width % stride:
             x = functional.pad(x, (0, -width % stride, 0, -height % stride))
         return channels_last(x)
+
+
+@dataclass(frozen=True)
+class GeneratorSettings:
+    """Settings of `Generator`: conf/model/generator/unet.yaml."""
+
+    base: int
+    multipliers: Sequence[int]
+    patch: int
+    refine: bool | str
+    style_share: float
+    rgb_skip: bool
+    feature_bound: float
+
+    def build(self, channels: Channels) -> Generator:
+        """The UNet of a scene's maps."""
+        refine = not channels.dense if self.refine == AUTO else self.refine
+        return Generator(
+            feature_channels=channels.feature,
+            segmentation_channels=channels.segmentation,
+            skeleton_channels=channels.skeleton,
+            pose_channels=channels.pose,
+            supersample=channels.supersample,
+            **(vars(self) | {"refine": refine}),
+        )
 
 
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:

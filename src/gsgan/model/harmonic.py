@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,7 +11,11 @@ from torch import Tensor, nn
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.residual_gaussians import ResidualGaussians, Residuals
+from gsgan.model.residual_gaussians import (
+    PlacedPoints,
+    ResidualGaussians,
+    Residuals,
+)
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
 from gsgan.splat.sh import sh_basis
@@ -237,6 +241,31 @@ def distil(
     if on_body is not None:
         on_body.offsets = None
     return copied.freeze()
+
+
+@dataclass(frozen=True)
+class HarmonicSettings:
+    """Settings of `Harmonic`: conf/model/deformation/harmonic.yaml."""
+
+    features: int
+    follow: Sequence[str]
+    opacity: float
+    mean_bound: float | None
+    scale_min: float
+    scale_max: float
+    logit_bound: float
+
+    def build(self, placed: PlacedPoints) -> Harmonic:
+        """The residuals of a scene's points."""
+        scale_max = placed.scale_max or self.scale_max
+        return Harmonic(
+            placed.rest_points,
+            placed.stature,
+            placed.joints,
+            sh_degree=placed.sh_degree,
+            mean_step=placed.mean_step,
+            **(vars(self) | {"scale_max": scale_max}),
+        )
 
 
 def _samples(

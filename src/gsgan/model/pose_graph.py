@@ -1,6 +1,7 @@
 """The pose encoder: skeleton to the global style code g ∈ R³⁵ (paper Sec. 3.5)."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -141,6 +142,31 @@ class PoseLinear(nn.Module):
     def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
         """g ``[B, 35]`` from ``pose`` ``[B, J, 3]`` (camera axes, body heights); Ω is unused."""
         return self.linear(pose.flatten(1))
+
+
+@dataclass(frozen=True)
+class PoseGraphSettings:
+    """Settings of `PoseGraph`: conf/model/pose_encoder/graph.yaml."""
+
+    template: str
+    width: int
+    joint_channels: int
+    octaves: int
+
+    def build(self) -> PoseGraph:
+        """The network, with new weights."""
+        return PoseGraph(**vars(self))
+
+
+@dataclass(frozen=True)
+class PoseLinearSettings:
+    """Settings of `PoseLinear`: conf/model/pose_encoder/linear.yaml."""
+
+    template: str
+
+    def build(self) -> PoseLinear:
+        """The layer, with new weights."""
+        return PoseLinear(self.template)
 
 
 def pose_inputs(

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
@@ -32,6 +32,37 @@ class Residuals:
     opacities: Tensor  # [B, N]
     sh: Tensor  # [B, N, (d+1)², 3]
     features: Tensor  # [B, N, F]
+
+
+class PlacedPoints(NamedTuple):
+    """What the scene and the points of G decide about Ψ.
+
+    Args:
+        rest_points: ``[N, 3]`` points at rest, in body heights.
+        stature: metres.
+        joints: of the skeleton.
+        sh_degree: of colour.
+        cameras: number of training cameras.
+        mean_step: see `ResidualGaussians`.
+        scale_max: largest scale in body heights; None: the setting's.
+        light: the world's up axis, if colours are multiplied by a light; None: they are not.
+    """
+
+    rest_points: Tensor
+    stature: float
+    joints: int
+    sh_degree: int
+    cameras: int
+    mean_step: float
+    scale_max: float | None
+    light: str | None
+
+
+class ResidualSettings(Protocol):
+    """The config group ``model/deformation``, which builds Ψ or what takes its place."""
+
+    def build(self, placed: PlacedPoints) -> "ResidualGaussians":
+        """The part, for the points of a scene."""
 
 
 class ResidualGaussians(nn.Module):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -46,6 +46,7 @@ class Segmentation(SkinnedGaussians):
         accuracy: the rasteriser's settings.
         labelled: whether the data has part labels, from which every shape and opacity learns.
             Without them the Gaussians stay as they are.
+        backend: of the rasteriser.
 
     Source: paper Sec. 3.4, which learns from labels; flat Gaussians are ours.
     """
@@ -53,7 +54,6 @@ class Segmentation(SkinnedGaussians):
     one_hot: Tensor
     vertex_labels: Tensor
     truth_table: Tensor
-    backend = "auto"  # of the rasteriser; replaced by benches
 
     def __init__(
         self,
@@ -67,6 +67,7 @@ class Segmentation(SkinnedGaussians):
         thickness: float = 0.1,
         accuracy: Accuracy = ACCURACY["standard"],
         labelled: bool = True,
+        backend: str = "auto",
     ) -> None:
         super().__init__(body, points, opacity, scale)
         self._flatten(body, scale, thickness)
@@ -75,6 +76,7 @@ class Segmentation(SkinnedGaussians):
 
         # The classes of S, and how the data's labels map to them.
         self.accuracy = accuracy
+        self.backend = backend
         self.map = class_map(
             body.label_names, body.vertex_labels, mode, hands_face
         )
@@ -189,6 +191,37 @@ class Segmentation(SkinnedGaussians):
         if frame.labels is not None:
             labels = self.truth(frame.labels)
         return segmentation_loss(self(frame.body, frame.camera), labels)
+
+
+@dataclass(frozen=True)
+class SegmentationSettings:
+    """Settings of `Segmentation`: conf/model/full.yaml."""
+
+    mode: str
+    hands_face: bool
+    points: int | None
+    opacity: float
+    scale: float
+    thickness: float
+    accuracy: Accuracy
+
+    def build(
+        self,
+        body: SkinnedBody,
+        *,
+        labelled: bool,
+        low_pass: float,
+        antialias: bool,
+        backend: str,
+    ) -> Segmentation:
+        """S of a person's body; its images are formed like those of F."""
+        accuracy = replace(
+            self.accuracy, low_pass=low_pass, antialias=antialias
+        )
+        settings = vars(self) | {"accuracy": accuracy}
+        return Segmentation(
+            body, labelled=labelled, backend=backend, **settings
+        )
 
 
 def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:

@@ -1,6 +1,7 @@
 """The ``lbs_splat`` baseline: Gaussians on the body's surface, moved by linear blend skinning."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -103,4 +104,26 @@ class SurfaceGaussians(SkinnedGaussians):
                 self.logit_opacities, -self.logit_bound, self.logit_bound
             ),
             colour_from(eye, means, A, sh),
+        )
+
+
+@dataclass(frozen=True)
+class SurfaceGaussiansSettings:
+    """Settings of `SurfaceGaussians`: conf/model/lbs_splat.yaml."""
+
+    points: int | None
+    opacity: float
+    scale: float
+    mean_bound: float
+    scale_min: float
+    scale_max: float
+    scale_spacings: float | None
+    logit_bound: float
+
+    def build(
+        self, body: SkinnedBody, stature: float, sh_degree: int
+    ) -> SurfaceGaussians:
+        """The Gaussians on a person's body."""
+        return SurfaceGaussians(
+            body, stature, sh_degree=sh_degree, **vars(self)
         )

@@ -25,6 +25,7 @@ from gsgan.prepare.sources import (
 )
 from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.checks import above, between, one_of, whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 
 PERSON_HEIGHTS = (0.4, 2.8)  # metres, of people
@@ -45,7 +46,7 @@ class MediaPipe:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(CommandOptions):
     """The config of `gsgan.prepare`; conf/prepare.yaml explains each key.
 
     Raises:

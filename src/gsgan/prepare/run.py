@@ -53,6 +53,7 @@ from gsgan.prepare.triangulate import plain, robust
 from gsgan.skeleton import MEDIAPIPE33, limb_length_sum
 from gsgan.skeleton.joints import BODY, FACE, FROM_PARTS, HANDS, is_known
 from gsgan.utils.arrays import Bytes, Float, Ints, evenly_spaced
+from gsgan.utils.console import make_console
 from gsgan.utils.errors import DataError, explain
 from gsgan.utils.files import read_json, write_json
 from gsgan.utils.frame_files import find_shifts
@@ -67,7 +68,7 @@ MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 STAGE_VERSION = 7
 
 
-def prepare(options: Options, console: Console) -> Path:
+def prepare(options: Options, console: Console | None = None) -> Path:
     """Makes the dataset ``options.out`` and checks it; the same dataset that exists is left alone.
 
     Returns:
@@ -77,6 +78,8 @@ def prepare(options: Options, console: Console) -> Path:
         GsganError: on anything the user can correct, also errors that the check of the dataset
             finds.
     """
+    console = console or make_console()
+
     # The same dataset, if it exists.
     out = options.folder("out")
     inputs = None if options.one_camera else read_inputs(options)

@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("render", "gsgan.render.run.render_config")
+main = entry(
+    "render",
+    task="gsgan.render.run.render",
+    options="gsgan.render.run.RenderOptions",
+)
 
 if __name__ == "__main__":
     main()

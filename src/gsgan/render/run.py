@@ -1,12 +1,13 @@
 """Renders a motion, or held-out frames, with the avatar of a run."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
 
@@ -25,10 +26,11 @@ from gsgan.run.drive import (
     joints_of,
     smooth,
 )
-from gsgan.run.runs import Run, marks_of
+from gsgan.run.runs import Run, RunReference, marks_of
 from gsgan.scene import Camera, cat
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.checks import above, whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
@@ -37,8 +39,29 @@ from gsgan.utils.images import Background, background, eight_bits
 STILL_SECONDS = 4.0
 
 
-def render_config(config: DictConfig) -> None:
-    """Renders the motion of a config.
+@dataclass(frozen=True)
+class RenderOptions(CommandOptions):
+    """The options of gsgan.render: conf/render.yaml."""
+
+    source: RunReference
+    driven: MotionOptions
+    camera: str | int | None
+    camera_unit: str | None
+    out: str | None
+    overwrite: bool
+    fps: float
+    start: int
+    frames: int | None
+    pixels: int | None
+    background: str | int
+    smooth: Mapping[str, Any]
+    orbit: Mapping[str, Any]
+    provenance: bool
+    distilled: bool
+
+
+def render(options: RenderOptions) -> None:
+    """Renders a motion.
 
     Raises:
         ConfigError: when an option has an invalid value, or the output exists.
@@ -47,21 +70,20 @@ def render_config(config: DictConfig) -> None:
     console = make_console()
 
     # Options are checked before the run is loaded.
-    output = _output(config)
-    paint_on = background(str(config.background), output.video)
-    fps = float(above("fps", config.fps))
-    motion = MotionOptions.from_config(config)
-    run = Run.from_config(config)
-    if config.distilled:
-        run.avatar = distil_run(motion, run)
+    output = _output(options)
+    paint_on = background(str(options.background), output.video)
+    fps = float(above("fps", options.fps))
+    run = options.source.load()
+    if options.distilled:
+        run.avatar = distil_run(options.driven, run)
     for mark in marks_of(run.checkpoint):
         console.print(mark, markup=False, highlight=False, soft_wrap=True)
 
     # The motion, and the camera of each frame.
-    drive = smooth(config.smooth, drive_of(motion, run, fps), fps)
-    drive = _choose(drive, config, fps)
+    drive = smooth(options.smooth, drive_of(options.driven, run, fps), fps)
+    drive = _choose(drive, options, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
-    cameras, index = _cameras(config, run, drive)
+    cameras, index = _cameras(options, run, drive)
     record = {
         "run": str(run.folder.resolve()),
         "drive": drive.text,
@@ -76,7 +98,7 @@ def render_config(config: DictConfig) -> None:
         total=len(drive.p),
     )
     with writing(output.out):
-        output.begin(record, bool(config.overwrite))
+        output.begin(record, bool(options.overwrite))
         output.write(drive.numbers, painted)
     if run.avatar.poses is not None:
         _print_distances(run.avatar.poses, run.avatar, drive, console)
@@ -103,27 +125,29 @@ def _print_distances(
     )
 
 
-def _output(config: DictConfig) -> Output:
+def _output(options: RenderOptions) -> Output:
     # A folder or a video; the folder may have a dot in its name.
-    if config.out is None:
+    if options.out is None:
         raise ConfigError(
             "out is not set: give out=<video.mp4>, or out=<folder> for PNG files"
         )
 
     # Every other ending is most likely a mistake; a number is none.
-    out = Path(config.out).expanduser()
+    out = Path(options.out).expanduser()
     usual = out.suffix.lower() in ("", ".mp4") or out.suffix[1:].isdecimal()
     if not usual and not out.is_dir():
         raise ConfigError(
             f"out={out} must be a .mp4 file, or a folder for PNG files"
         )
-    return Output(out, float(above("fps", config.fps)), bool(config.provenance))
+    return Output(
+        out, float(above("fps", options.fps)), bool(options.provenance)
+    )
 
 
-def _choose(drive: Drive, config: DictConfig, fps: float) -> Drive:
+def _choose(drive: Drive, options: RenderOptions, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
     # The first frame must exist.
-    start = whole("start", config.start, 0)
+    start = whole("start", options.start, 0)
     total = len(drive.p)
     if start >= total:
         raise ConfigError(
@@ -133,8 +157,8 @@ def _choose(drive: Drive, config: DictConfig, fps: float) -> Drive:
     # A single pose is shown for some seconds, unless the user gives a number of frames.
     still = total == 1 and drive.camera is None
     count = round(STILL_SECONDS * fps) if still else total - start
-    if config.frames is not None:
-        count = whole("frames", config.frames, 1)
+    if options.frames is not None:
+        count = whole("frames", options.frames, 1)
         count = count if still else min(count, total - start)
     if still:
         return drive.rows(np.zeros(count, np.int64))
@@ -145,24 +169,24 @@ def _choose(drive: Drive, config: DictConfig, fps: float) -> Drive:
 
 
 def _cameras(
-    config: DictConfig, run: Run, drive: Drive
+    options: RenderOptions, run: Run, drive: Drive
 ) -> tuple[Camera, Tensor | None]:
     """One camera, or one per frame; and their indices, if images are to have their colours."""
     # A held-out motion comes with its camera, at the size of its images.
-    trained = run.stored.data.size
+    trained = run.trained_as.image_size
     if drive.camera is not None:
         camera, index = drive.camera
-        if config.pixels is not None:
+        if options.pixels is not None:
             height, width = camera.size
-            side = whole("pixels", config.pixels, 1)
+            side = whole("pixels", options.pixels, 1)
             camera = camera.resize((side, round(side * width / height)))
         return camera, index
 
     # All others give square images, by default as large as in training.
-    size = whole("pixels", config.pixels or trained or 512, 1)
-    name = "orbit" if config.camera is None else str(config.camera)
+    size = whole("pixels", options.pixels or trained or 512, 1)
+    name = "orbit" if options.camera is None else str(options.camera)
     if name == "orbit":
-        orbit = Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
+        orbit = Orbit(**options.orbit)
         cameras = orbit.cameras(
             drive.p, run.proportions, run.scene, size, trained or size
         )
@@ -171,7 +195,7 @@ def _cameras(
     # A calibration file, or a camera of the run's data.
     path = Path(name).expanduser()
     if path.is_file():
-        return from_file(path, drive.p, size, config.camera_unit), None
+        return from_file(path, drive.p, size, options.camera_unit), None
     entries = run.data.layout.cameras
     if name not in entries:
         raise ConfigError(

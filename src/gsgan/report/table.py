@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from hydra.utils import instantiate
-from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsgan.metrics.names import BOX_METRICS, FLOOR_VARIANT, FULL, METRICS, SPLAT
@@ -41,6 +39,7 @@ from gsgan.report.write import (
     files_of,
     join_unique,
 )
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -296,23 +295,33 @@ def _column_facts(
     }
 
 
-def make_tables(config: DictConfig) -> None:
-    """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
+@dataclass(frozen=True)
+class TableOptions(CommandOptions):
+    """The options of tables: conf/report.yaml."""
+
+    table: TableSpec
+    runs: str | Sequence[str] | None
+    allow_dirty: bool
+    out: str | None
+
+
+def make_tables(options: TableOptions) -> None:
+    """Writes a table of runs.
 
     Raises:
         ConfigError: on runs that do not exist or are not comparable, or on a folder that cannot be
             written.
     """
     # All settings are read before any run is.
-    given = [config.runs] if isinstance(config.runs, str) else config.runs
-    spec: TableSpec = instantiate(config.table)
+    given = [options.runs] if isinstance(options.runs, str) else options.runs
+    spec = options.table
     paper = None if spec.paper is None else read_paper(spec.paper)
-    runs, left_out = read_runs(find_runs(list(map(str, given))))
-    report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
+    runs, left_out = read_runs(find_runs(list(map(str, given or ()))))
+    report = build(spec, runs, left_out, paper, allow_dirty=options.allow_dirty)
 
     # Files are written into a folder named after the time, unless ``out`` names one.
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
-    folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
+    folder = Path(str(options.out or f"runs/report/{now}")).expanduser()
 
     # All formats are made before the first file is written.
     files = files_of(report)

@@ -1,17 +1,15 @@
-"""Builds the data module and the avatar of a config."""
+"""Builds the avatar that a config describes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol, Self
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
@@ -22,27 +20,33 @@ from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.effects.record import OFF
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import (
-    AUTO,
     DENSE,
     BodyPoints,
+    BodyPointsSettings,
     points_per_pixel,
 )
 from gsgan.model.colour import ColourCorrection
-from gsgan.model.deformation import Deformation
-from gsgan.model.generator import Generator
-from gsgan.model.residual_gaussians import ResidualGaussians
-from gsgan.model.segmentation import Segmentation
+from gsgan.model.deformation import DeformationSettings
+from gsgan.model.generator import Channels, GeneratorFactory
+from gsgan.model.pose_graph import (
+    PoseGraph,
+    PoseGraphSettings,
+    PoseLinear,
+    PoseLinearSettings,
+)
+from gsgan.model.residual_gaussians import PlacedPoints, ResidualSettings
+from gsgan.model.segmentation import SegmentationSettings
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.run.class_vote import label_body
 from gsgan.scene import Frame
-from gsgan.skeleton import Densify, SkeletonTemplate, template_of
+from gsgan.skeleton import Densify, template_of
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import one_of
+from gsgan.utils.config import CommandOptions, build
 from gsgan.utils.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData  # loads lightning
-
 
 OPTIONS = (
     "backend",
@@ -51,84 +55,23 @@ OPTIONS = (
     "window_minimum",
     "generator_margin",
 )  # of `Avatar`
+PoseEncoderSettings = PoseGraphSettings | PoseLinearSettings
 
 
-def build_data(config: DictConfig) -> GsganData:
-    """The data module of a config, its dataset made if need be, read and checked."""
-    # Images are undistorted when they are read, so the dataset knows that effect.
-    distortion = _effect_settings(config).value_of("distortion")
-    data: GsganData = instantiate(config.data, distortion=distortion)
-    data.prepare_data()
-    data.setup()
-    return data
+class SurfaceFactory(Protocol):
+    """The key ``model.surface``, which builds Gaussians on a body."""
 
-
-def moves_with_body(config: DictConfig) -> bool:
-    """Whether a config's model has parts that move with a skinned body, if the data has one."""
-    # S and Gaussians on the body always need it; placing G there is an effect.
-    model = config.model
-    if (
-        model.get("segmentation") is not None
-        or model.get("surface") is not None
-    ):
-        return True
-    on_body = _effect_settings(config).value_of("body_points") != OFF
-    return model.get("body_points") is not None and on_body
-
-
-def build_avatar(
-    config: DictConfig,
-    scene: SceneInfo,
-    images: Subset[Frame] | None = None,
-    *,
-    effects: Effects | None = None,
-    vertex_labels: Tensor | None = None,
-) -> Avatar:
-    """The untrained avatar of a config, its weights from ``config.seed``.
-
-    Args:
-        config: of a run.
-        scene: facts about the training split.
-        images: training frames with part labels, for the class vote.
-        effects: decided when training began; None decides them now.
-        vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
-
-    Raises:
-        ConfigError: on a forced effect that is not possible, on parts that do not go together, or
-            on a key that is not read.
-        DataError: when the data lacks the body that the model needs.
-    """
-    # The experiment sets keys of `densify` in models that have no such part.
-    densify = config.model.get("densify")
-    if densify is not None and "_target_" not in densify:
-        raise ConfigError(
-            "experiment=paper changes parts that this model does not have; it goes with "
-            "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
-        )
-
-    # Parts draw their weights when they are made, so the seed comes first.
-    torch.manual_seed(config.seed)
-    with naming_group("model"):
-        parts: AvatarParts = instantiate(config.model)()
-        settings = _effect_settings(config)
-        effects = effects or decide(scene, settings, parts.in_effects)
-
-        # S needs the body with a label per vertex.
-        labelled: tuple[SkinnedBody | None, str] = (
-            None,
-            "the model leaves it out",
-        )
-        if parts.segmentation is not None:
-            labelled = label_body(scene, images, vertex_labels)
-        return _assemble(parts, scene, effects, labelled, config.seed)
+    def build(
+        self, body: SkinnedBody, stature: float, sh_degree: int
+    ) -> SurfaceGaussians:
+        """The Gaussians on a person's body."""
 
 
 @dataclass(frozen=True)
 class AvatarParts:
     """The config group ``model`` (keys: conf/model/full.yaml).
 
-    Parts whose sizes depend on the scene are functions of those sizes (``_partial_`` in the
-    config).
+    Parts whose sizes depend on the scene, or that draw their weights, are settings that build them.
 
     Args:
         accuracy: the rasteriser's settings for F.
@@ -144,29 +87,32 @@ class AvatarParts:
         window_margin, window_multiple, window_minimum, generator_margin: of `Avatar`.
 
     Raises:
-        ValueError: on parts that do not go together.
+        ConfigError, ValueError: on parts that do not go together.
     """
 
-    # Every model names these, if only as null.
     accuracy: Accuracy
     densify: Densify | None
-    deformation: Callable[..., ResidualGaussians] | None
-    segmentation: Callable[..., Segmentation] | None
-    pose_encoder: nn.Module | None
-    generator: Callable[..., Generator] | None
-
-    # Some models have these, too.
-    surface: Callable[..., SurfaceGaussians] | None = None
-    body_points: partial[BodyPoints] | None = None
-    low_pass: float = 0.3
-    supersample: int = 1
-    backend: str = "auto"
-    window_margin: float | None = 0.25
-    window_multiple: int = 16
-    window_minimum: int = 32
-    generator_margin: int | None = 8
+    deformation: ResidualSettings | None
+    segmentation: SegmentationSettings | None
+    pose_encoder: PoseEncoderSettings | None
+    generator: GeneratorFactory | None
+    body_points: BodyPointsSettings | None
+    low_pass: float
+    supersample: int
+    backend: str
+    window_margin: float | None
+    window_multiple: int
+    window_minimum: int
+    generator_margin: int | None
+    surface: SurfaceFactory | None = None  # one model alone has it
 
     def __post_init__(self) -> None:
+        # The experiment sets keys of `densify` in models that have no such part.
+        if isinstance(self.densify, Mapping):
+            raise ConfigError(
+                "experiment=paper changes parts that this model does not have; it goes with "
+                "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
+            )
         one_of("model.backend", self.backend, BACKENDS)
 
         # Pairs of parts that need each other.
@@ -189,15 +135,101 @@ class AvatarParts:
         return ModelParts(
             splats=self.densify is not None or self.surface is not None,
             points=self.densify is not None,
-            network=issubclass(
-                getattr(self.deformation, "func", object), Deformation
-            ),
+            network=isinstance(self.deformation, DeformationSettings),
             body_points=self.body_points is not None,
+        )
+
+
+@dataclass(frozen=True)
+class AvatarSettings(CommandOptions):
+    """What a config says of an avatar.
+
+    Args:
+        model: its parts.
+        seed: of their weights.
+        effects: requested; a shared avatar's were decided when it was trained.
+    """
+
+    model: AvatarParts
+    seed: int
+    effects: EffectSettings | None = None
+
+    @property
+    def moves_with_body(self) -> bool:
+        """Whether parts move with a skinned body, if the data has one."""
+        # S and Gaussians on the body always need it; placing G there is an effect.
+        model = self.model
+        if model.segmentation is not None or model.surface is not None:
+            return True
+        if model.body_points is None or self.effects is None:
+            return False
+        return self.effects.value_of("body_points") != OFF
+
+
+@dataclass(frozen=True)
+class RunSettings(CommandOptions):
+    """What a run's config says of its avatar, and its data, which is not read yet."""
+
+    avatar: AvatarSettings
+    data: GsganData
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> Self:
+        """The settings of a config."""
+        # Images are undistorted when they are read, so the dataset knows that effect.
+        avatar = AvatarSettings.from_config(config)
+        settings = avatar.effects or EffectSettings()
+        distortion = settings.value_of("distortion")
+        return cls(avatar, build(config.data, distortion=distortion))
+
+
+def build_avatar(
+    settings: AvatarSettings,
+    scene: SceneInfo,
+    images: Subset[Frame] | None = None,
+    *,
+    effects: Effects | None = None,
+    vertex_labels: Tensor | None = None,
+) -> Avatar:
+    """An untrained avatar, its weights from the seed.
+
+    Args:
+        settings: its parts.
+        scene: facts about the training split.
+        images: training frames with part labels, for the class vote.
+        effects: decided when training began; None decides them now.
+        vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
+
+    Raises:
+        ConfigError: on a forced effect that is not possible, or on a value that a part refuses.
+        DataError: when the data lacks the body that the model needs.
+    """
+    parts = settings.model
+    with naming_group("model"):
+        # Every group of parts draws its weights from a seed of its own.
+        torch.manual_seed(settings.seed)
+        encoder = None
+        if parts.pose_encoder is not None:
+            encoder = parts.pose_encoder.build()
+        if effects is None:
+            assert settings.effects is not None
+            effects = decide(scene, settings.effects, parts.in_effects)
+
+        # S needs the body with a label per vertex.
+        labelled: tuple[SkinnedBody | None, str] = (
+            None,
+            "the model leaves it out",
+        )
+        if parts.segmentation is not None:
+            labelled = label_body(scene, images, vertex_labels)
+        return _assemble(
+            parts, encoder, scene, effects, labelled, settings.seed
         )
 
 
 def _assemble(
     parts: AvatarParts,
+    encoder: PoseGraph | PoseLinear | None,
     scene: SceneInfo,
     effects: Effects,
     labelled: tuple[SkinnedBody | None, str],
@@ -210,11 +242,7 @@ def _assemble(
     """
     template = template_of(scene.skeleton, scene.face)
     stature = template.stature_of(scene.limb_length_sum)
-    sizes = {"stature": stature, "sh_degree": effects.degree}
-    formation: dict[str, Any] = {
-        "low_pass": parts.low_pass,
-        "antialias": effects.antialias.on,
-    }
+    antialias = effects.antialias.on
 
     # The points, and Ψ, which moves them; or Gaussians that move with the body alone.
     torch.manual_seed(seed + 1)
@@ -222,24 +250,35 @@ def _assemble(
     points = body_points or parts.densify
     deformation = surface = None
     if parts.deformation and points:
-        deformation = parts.deformation(
+        light = None
+        if effects.light.on:
+            assert scene.proportions is not None
+            light = scene.proportions.up
+        placed = PlacedPoints(
             rest_points=points.rest_points,
+            stature=stature,
             joints=len(template.names),
-            **sizes,
-            **_set_by_scene(parts, scene, effects, body_points),
+            sh_degree=effects.degree,
+            cameras=scene.n_train_cameras,
+            mean_step=1.0 if body_points is None else body_points.mean_step,
+            scale_max=None if body_points is None else body_points.scale_max,
+            light=light,
         )
+        deformation = parts.deformation.build(placed)
     if parts.surface:
         body = _require_body(scene, "model.surface")
-        surface = parts.surface(body=body, **sizes)
+        surface = parts.surface.build(body, stature, effects.degree)
 
     # S forms its images like F.
     segmentation = None
     if parts.segmentation and labelled[0] is not None:
-        segmentation = parts.segmentation(
-            body=labelled[0], labelled=scene.has_labels
+        segmentation = parts.segmentation.build(
+            labelled[0],
+            labelled=scene.has_labels,
+            low_pass=parts.low_pass,
+            antialias=antialias,
+            backend=parts.backend,
         )
-        segmentation.accuracy = replace(segmentation.accuracy, **formation)
-        segmentation.backend = parts.backend
 
     # Parts on a body need its solver for skeletons without a body pose.
     solver = None
@@ -255,7 +294,19 @@ def _assemble(
             len(body_points.points), stature, scene.scale_train[1]
         )
         dense = per_pixel >= DENSE
-    generator = _generator(parts, template, splats, segmentation, dense=dense)
+    generator = None
+    if parts.generator and encoder:
+        # If nothing is splatted, the drawn skeleton takes F's place.
+        drawn = len(template.draw_groups)
+        channels = Channels(
+            feature=3 + splats.features if splats else drawn,
+            segmentation=segmentation.classes if segmentation else 0,
+            skeleton=drawn if splats else 0,
+            pose=encoder.channels,
+            supersample=parts.supersample if splats else 1,
+            dense=dense,
+        )
+        generator = parts.generator.build(channels)
     colour = None
     if effects.colour_correction.on:
         colour = ColourCorrection(effects.cameras, scene.camera_names)
@@ -263,7 +314,10 @@ def _assemble(
         effects=effects,
         template=template,
         accuracy=replace(
-            parts.accuracy, supersample=parts.supersample, **formation
+            parts.accuracy,
+            supersample=parts.supersample,
+            low_pass=parts.low_pass,
+            antialias=antialias,
         ),
         limb_length_sum=scene.limb_length_sum,
         stature=stature,
@@ -273,7 +327,7 @@ def _assemble(
         surface=surface,
         segmentation=segmentation,
         segmentation_why=labelled[1],
-        pose_encoder=parts.pose_encoder,
+        pose_encoder=encoder,
         generator=generator,
         colour=colour,
         poses=scene.poses,
@@ -288,73 +342,8 @@ def _body_points(
     """Points on the skinned body; None where Gaussians start from the skeleton's shapes."""
     if not (parts.densify and parts.body_points and effects.body_points.on):
         return None
-    return parts.body_points(
-        body=_require_body(scene, "effects.body_points=on"),
-        stature=stature,
-        scale=scene.scale_train[1],
-    )
-
-
-def _set_by_scene(
-    parts: AvatarParts,
-    scene: SceneInfo,
-    effects: Effects,
-    body_points: BodyPoints | None,
-) -> dict[str, Any]:
-    """Arguments of Ψ that the scene or the points decide."""
-    settings: dict[str, Any] = {}
-    if body_points is not None:
-        settings["mean_step"] = body_points.mean_step
-        if body_points.scale_max is not None:
-            settings["scale_max"] = body_points.scale_max
-
-    # A config with normals=null leaves it to the number of cameras.
-    given = getattr(parts.deformation, "keywords", {})
-    if given.get("normals", False) is None:
-        settings["normals"] = scene.n_train_cameras > 1
-    if effects.light.on:
-        assert scene.proportions is not None
-        settings["light"] = scene.proportions.up
-    return settings
-
-
-def _generator(
-    parts: AvatarParts,
-    template: SkeletonTemplate,
-    splats: ResidualGaussians | SurfaceGaussians | None,
-    segmentation: Segmentation | None,
-    *,
-    dense: bool,
-) -> Generator | None:
-    """The UNet; if nothing is splatted, the drawn skeleton takes F's place.
-
-    ``dense``: Gaussians on the body are as many as pixels, which a last level would not sharpen.
-    """
-    if parts.generator is None or parts.pose_encoder is None:
-        return None
-
-    # A generator of one's own need not have the setting.
-    options: dict[str, Any] = {}
-    if getattr(parts.generator, "keywords", {}).get("refine") == AUTO:
-        options["refine"] = not dense
-
-    # Channels of its inputs; F has three for the colour of Step I before its features.
-    drawn = len(template.draw_groups)
-    return parts.generator(
-        feature_channels=3 + splats.features if splats else drawn,
-        segmentation_channels=segmentation.classes if segmentation else 0,
-        skeleton_channels=drawn if splats else 0,
-        pose_channels=parts.pose_encoder.channels,
-        supersample=parts.supersample if splats else 1,
-        **options,
-    )
-
-
-def _effect_settings(config: DictConfig) -> EffectSettings:
-    """The effects group of a config; commands that score other methods have none."""
-    return (
-        instantiate(config.effects) if "effects" in config else EffectSettings()
-    )
+    body = _require_body(scene, "effects.body_points=on")
+    return parts.body_points.build(body, stature, scene.scale_train[1])
 
 
 @contextmanager

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from gsgan.data.splits import SPLITS
@@ -49,6 +48,7 @@ from gsgan.skeleton.proportions import (
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, between, one_of
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
@@ -102,7 +102,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class MotionOptions:
+class MotionOptions(CommandOptions):
     """The options of a motion; conf/render.yaml explains them.
 
     Raises:
@@ -130,14 +130,6 @@ class MotionOptions:
         one_of("retarget", self.retarget, ("auto", True, False))
         one_of("up", self.up, (None, *UP_AXES))
 
-    @classmethod
-    def from_config(cls, config: DictConfig) -> MotionOptions:
-        """The options of a command; those that it lacks take their defaults."""
-        # Commands have options of their own beside these.
-        plain: Any = OmegaConf.to_container(config, resolve=True)
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: plain[name] for name in names if name in plain})
-
 
 def drive_of(options: MotionOptions, run: Run, fps: float) -> Drive:
     """The whole motion at ``fps`` frames per second.
@@ -159,11 +151,10 @@ def smooth(settings: Mapping[str, Any], drive: Drive, fps: float) -> Drive:
     Raises:
         ConfigError: on a setting of the filter that is out of range.
     """
-    # The other settings are those of the filter.
-    own = dict(settings)
-    if not own.pop("enabled"):
+    filter_settings = dict(settings)
+    if not filter_settings.pop("enabled"):
         return drive
-    one_euro = OneEuro(**own)
+    one_euro = OneEuro(**filter_settings)
 
     # Held-out frames may be apart; then the filter starts anew.
     joints = []

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
-from gsgan.run.assemble import build_avatar, build_data
+from gsgan.run.assemble import AvatarSettings, RunSettings, build_avatar
 from gsgan.run.shared import (
     CONFIG_FILE,
     find_avatar,
@@ -38,6 +38,7 @@ from gsgan.run.stored import (
 from gsgan.skeleton import HOLISTIC
 from gsgan.skeleton.proportions import Proportions
 from gsgan.skeleton.tensors import constants
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
@@ -68,33 +69,68 @@ def load(
     return avatar.to(pick_device(device))
 
 
+@dataclass(frozen=True)
+class TrainedAs:
+    """What else a run's config says of its avatar.
+
+    Args:
+        image_size: pixels of the training images; None: sizes of their own.
+        seed: of the run, or None.
+        character: of the default person's dataset, or None.
+    """
+
+    image_size: int | None
+    seed: int | None
+    character: str | None
+
+
 def read_avatar(
     folder: Path, smpl: str | None = None
-) -> tuple[Avatar, DictConfig, dict[str, Any]]:
-    """The trained, frozen avatar of a run folder or of a shared avatar's; its config, and ``gsgan``
-    of its checkpoint."""
+) -> tuple[Avatar, TrainedAs, dict[str, Any]]:
+    """The trained, frozen avatar of a run folder or of a shared avatar's; facts of its config, and
+    ``gsgan`` of its checkpoint."""
     # A shared avatar may come from anybody, and be damaged anywhere.
     if is_shared(folder):
         with refusing_damage(folder / CONFIG_FILE):
             config, checkpoint = read_shared(folder)
-            avatar = avatar_of(folder, config, checkpoint, smpl)
-        return avatar, config, checkpoint["gsgan"]
+            settings = AvatarSettings.from_config(config)
+            avatar = avatar_of(folder, settings, checkpoint, smpl)
+    else:
+        # The config says how the avatar is built, and the checkpoint has its weights.
+        config = read_config(folder)
+        checkpoint = read_checkpoint(folder / CHECKPOINT)
+        settings = avatar_settings(folder, config)
+        avatar = avatar_of(folder, settings, checkpoint, smpl)
+    trained_as = TrainedAs(
+        image_size=OmegaConf.select(config, "data.size"),
+        seed=config.get("seed"),
+        character=OmegaConf.select(config, "data.source.avatar"),
+    )
+    return avatar, trained_as, checkpoint["gsgan"]
 
-    # The config says how the avatar is built, and the checkpoint has its weights.
-    config = read_config(folder)
-    checkpoint = read_checkpoint(folder / CHECKPOINT)
-    avatar = avatar_of(folder, config, checkpoint, smpl)
-    return avatar, config, checkpoint["gsgan"]
+
+def avatar_settings(folder: Path, config: DictConfig) -> AvatarSettings:
+    """What the config of a run folder says of its avatar.
+
+    Raises:
+        DataError: when nothing can be built from it.
+    """
+    try:
+        return AvatarSettings.from_config(config)
+    except ConfigError as error:
+        raise DataError(
+            f"{folder}: no avatar can be built from its config: {error}"
+        ) from error
 
 
 def load_avatar(
-    folder: Path, config: DictConfig, data: GsganData
+    folder: Path, settings: AvatarSettings, data: GsganData
 ) -> tuple[Avatar, list[str]]:
     """The trained, frozen avatar of a run folder, to render its data, and the marks of its tables.
 
     Args:
         folder: of the run.
-        config: of the run.
+        settings: of its config.
         data: its dataset, from which the body model file and the order of the cameras are taken.
     """
     # Facts that depend on where the data is now replace the stored ones.
@@ -106,7 +142,7 @@ def load_avatar(
         camera_names=data.layout.camera_names,
     )
     marks = marks_of(checkpoint["gsgan"])
-    return _load_trained(folder, config, checkpoint, scene), marks
+    return _load_trained(folder, settings, checkpoint, scene), marks
 
 
 def marks_of(facts: Mapping[str, Any]) -> list[str]:
@@ -122,7 +158,7 @@ def marks_of(facts: Mapping[str, Any]) -> list[str]:
 
 def avatar_of(
     folder: Path,
-    config: DictConfig,
+    settings: AvatarSettings,
     checkpoint: dict[str, Any],
     smpl: str | None = None,
 ) -> Avatar:
@@ -130,7 +166,7 @@ def avatar_of(
 
     Args:
         folder: of the run, for messages.
-        config: of the run.
+        settings: of its config.
         checkpoint: its weights, and what it stores of the scene.
         smpl: as for `load`.
     """
@@ -138,13 +174,13 @@ def avatar_of(
     scene = read_scene(checkpoint["gsgan"]["scene"])
     file = absolute_path(folder, scene.body_file) if smpl is None else smpl
     return _load_trained(
-        folder, config, checkpoint, replace(scene, body_file=file)
+        folder, settings, checkpoint, replace(scene, body_file=file)
     )
 
 
 def _load_trained(
     folder: Path,
-    config: DictConfig,
+    settings: AvatarSettings,
     checkpoint: dict[str, Any],
     scene: SceneInfo,
 ) -> Avatar:
@@ -162,7 +198,7 @@ def _load_trained(
     effects = Effects.from_plain(stored["effects"])
     try:
         avatar = build_avatar(
-            config, scene, effects=effects, vertex_labels=labels
+            settings, scene, effects=effects, vertex_labels=labels
         )
     except (TypeError, ValueError, OverflowError) as error:
         reason = str(error).split("\n")[0]
@@ -193,32 +229,17 @@ class Run:
 
     Args:
         folder: of the run.
-        stored: its config.
+        trained_as: facts of its config.
         checkpoint: ``gsgan`` of its checkpoint.
         avatar: frozen.
         paths: of its dataset and body model file.
     """
 
     folder: Path
-    stored: DictConfig
+    trained_as: TrainedAs
     checkpoint: dict[str, Any]
     avatar: Avatar
     paths: DataPaths = field(default_factory=DataPaths)
-
-    @classmethod
-    def from_config(cls, config: DictConfig, device: str | None = None) -> Run:
-        """The run that a command's config names, on its device or on another.
-
-        Raises:
-            ConfigError: when it is not set.
-            DataError: when the folder holds no run, or a damaged one.
-        """
-        if config.run is None:
-            raise ConfigError(
-                "run is not set: give run=<the folder that gsgan.train printed>"
-            )
-        paths = DataPaths.from_config(config)
-        return cls.load(config.run, paths, device or config.device)
 
     @classmethod
     def load(
@@ -240,10 +261,10 @@ class Run:
         # The dataset itself is opened later, and only by commands that need it.
         folder = find_avatar(name)
         paths = paths or DataPaths()
-        avatar, stored, checkpoint = read_avatar(folder, paths.smpl)
+        avatar, trained_as, checkpoint = read_avatar(folder, paths.smpl)
         return cls(
             folder=folder,
-            stored=stored,
+            trained_as=trained_as,
             checkpoint=checkpoint,
             avatar=avatar.to(pick_device(device)),
             paths=paths,
@@ -266,7 +287,8 @@ class Run:
                 f"{self.folder}: a shared avatar comes without its dataset; give motion=<file> or "
                 "motion=rest, and camera=orbit or a calibration file"
             )
-        return build_data(load_config(self.folder, self.paths))
+        config = load_config(self.folder, self.paths)
+        return RunSettings.from_config(config).data.read()
 
     @property
     def scene(self) -> SceneInfo:
@@ -304,3 +326,31 @@ class Run:
         return constants(
             template, torch.device("cpu"), torch.float64
         ).face_rest.numpy()
+
+
+@dataclass(frozen=True)
+class RunReference(CommandOptions):
+    """The options of a command that name a run, and where its dataset and model file are now."""
+
+    run: str | None
+    data_root: str | None
+    data_smpl: str | None
+    device: str = "auto"
+
+    @property
+    def paths(self) -> DataPaths:
+        """The paths of the dataset and of the body model file."""
+        return DataPaths(self.data_root, self.data_smpl)
+
+    def load(self) -> Run:
+        """The run, on the device.
+
+        Raises:
+            ConfigError: when it is not set.
+            DataError: when the folder holds no run, or a damaged one.
+        """
+        if self.run is None:
+            raise ConfigError(
+                "run is not set: give run=<the folder that gsgan.train printed>"
+            )
+        return Run.load(self.run, self.paths, self.device)

@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from gsgan.run.stored import CONFIG
+from gsgan.run.stored import CONFIG, read_config, renew
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import read_json
@@ -107,15 +107,28 @@ def read_shared(folder: Path) -> tuple[DictConfig, dict[str, Any]]:
             program.
     """
     path = folder / CONFIG_FILE
-    content = read_json(path)
+    content = _read_content(path)
+    config = check_config(path, content["config"])
+    state, _ = read_weights(folder / WEIGHTS_FILE)
+    return config, {"gsgan": content["gsgan"], "state_dict": state}
+
+
+def own_config(folder: Path) -> DictConfig:
+    """`check_config` of a run folder, or of a shared avatar's."""
+    if not is_shared(folder):
+        return check_config(folder, read_config(folder))
+    path = folder / CONFIG_FILE
+    return check_config(path, _read_content(path)["config"])
+
+
+def _read_content(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = read_json(path)
     if not content.keys() >= ENTRIES:
         raise DataError(
             f"{path}: not the config of a gsgan avatar (expected entries "
             f"{', '.join(sorted(ENTRIES))})"
         )
-    config = check_config(path, content["config"])
-    state, _ = read_weights(folder / WEIGHTS_FILE)
-    return config, {"gsgan": content["gsgan"], "state_dict": state}
+    return content
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -170,6 +183,7 @@ def check_config(path: Path, plain: Any) -> DictConfig:
 
     # Every value of the config is visited, however deep it lies.
     config = OmegaConf.create(plain)
+    renew(config)
     model = OmegaConf.to_container(config["model"], resolve=True)
     pending: list[Any] = [model]
     while pending:

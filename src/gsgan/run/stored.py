@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
@@ -21,6 +21,21 @@ from gsgan.utils.errors import ConfigError, DataError
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # Keys that configs of runs before 2026-11-29 have, and that nothing reads now.
 UNREAD_KEYS = ("effects.generator", "effects.gaussians_per_pixel")
+# What such configs build, and is now built by settings of the same name.
+PARTS = "gsgan.run.assemble.AvatarParts"
+OLD_TARGETS = (
+    "gsgan.model.body_points.BodyPoints",
+    "gsgan.model.deformation.Deformation",
+    "gsgan.model.discriminator.Discriminator",
+    "gsgan.model.generator.Generator",
+    "gsgan.model.harmonic.Harmonic",
+    "gsgan.model.pose_graph.PoseGraph",
+    "gsgan.model.pose_graph.PoseLinear",
+    "gsgan.model.segmentation.Segmentation",
+    "gsgan.model.surface.SurfaceGaussians",
+    "gsgan.losses.perceptual.Perceptual",
+    "gsgan.train.module.AvatarTraining",
+)
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
@@ -62,11 +77,6 @@ class DataPaths:
 
     root: str | None = None
     smpl: str | None = None
-
-    @classmethod
-    def from_config(cls, config: DictConfig) -> DataPaths:
-        """The paths ``data_root`` and ``data_smpl`` of a command's config."""
-        return cls(config.data_root, config.data_smpl)
 
     def refuse_without_run(self) -> None:
         """Raises a ConfigError if a path is given without a run."""
@@ -112,15 +122,29 @@ def read_yaml(path: Path) -> DictConfig:
         ) from None
     if not isinstance(config, DictConfig):
         raise DataError(f"{path}: damaged (expected keys with values)")
-    drop_unread(config)
+    renew(config)
     return config
 
 
-def drop_unread(settings: MutableMapping[str, Any]) -> None:
-    """Removes `UNREAD_KEYS` from a config, or from its `record`, in place."""
+def renew(settings: MutableMapping[str, Any]) -> None:
+    """Gives the config of an older run, or its `record`, the present names, in place."""
     for key in UNREAD_KEYS:
         group, last = _group(settings, key)
         group.pop(last, None)
+
+    # A module `gsgan.model.….Generator` is built by its settings.
+    for name in ("model", "training"):
+        parts = settings.get(name)
+        if not isinstance(parts, MutableMapping):
+            continue
+        for node in (parts, *parts.values()):
+            if not isinstance(node, MutableMapping):
+                continue
+            target = node.get("_target_")
+            if target in OLD_TARGETS:
+                node["_target_"] = f"{target}Settings"
+            if target in (*OLD_TARGETS, PARTS):
+                node.pop("_partial_", None)
 
 
 def _group(
@@ -161,6 +185,52 @@ def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
             )
         OmegaConf.update(config, f"data.{key}", place)
     return config
+
+
+def other_capture(folder: Path, given: str | Mapping[str, Any]) -> DictConfig:
+    """A run's config with the data of another capture: its folder, or the keys that differ.
+
+    Body poses are left out, as they are of another body, and so are the run's splits.
+
+    Raises:
+        ConfigError: on a key that the run's data lacks.
+    """
+    config = read_config(folder)
+
+    # The run's own data, splits and protocol do not hold for another capture.
+    cameras = ("train_cameras", "test_cameras")
+    splits = (*cameras, "train_frames", "test_frames", "train_poses")
+    cleared = dict.fromkeys(("root", "protocol", *splits)) | {"body": "none"}
+    config.data.merge_with(cleared)
+
+    # Only keys that the data has can be changed.
+    OmegaConf.set_struct(config, True)
+    try:
+        config.data.merge_with(
+            {"root": given} if isinstance(given, str) else given
+        )
+    except ConfigKeyError as error:
+        raise ConfigError(
+            f"other_capture: {str(error).splitlines()[0]} of the run's data"
+        ) from None
+    return config
+
+
+class Chosen(NamedTuple):
+    """What may have watched a run's validation images.
+
+    Args:
+        callbacks: settings by name.
+        objective: of a search, or None.
+    """
+
+    callbacks: Mapping[str, Mapping[str, Any]]
+    objective: str | None
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Chosen:
+        """The settings of a run's config."""
+        return cls(config.get("callbacks") or {}, config.get("objective"))
 
 
 def absolute_path(folder: Path, path: str | None) -> str | None:

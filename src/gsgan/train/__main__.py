@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("train", "gsgan.train.run.run_training")
+main = entry(
+    "train",
+    task="gsgan.train.run.run_training",
+    options="gsgan.train.run.TrainOptions",
+)
 
 if __name__ == "__main__":
     main()

@@ -1,6 +1,7 @@
 """What a run prints when it begins: its data, parts, effects and stand-ins."""
 
 from pathlib import Path
+from typing import Any
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
@@ -101,7 +102,7 @@ def _parts(module: AvatarTraining) -> list[Row]:
     """The networks and their sizes."""
     avatar = module.avatar
     plain = getattr(avatar.deformation, "from_normal", avatar) is None
-    parts = {
+    parts: dict[str, Any] = {
         "Ψ, without normals" if plain else "Ψ": avatar.deformation,
         "surface": avatar.surface,
         "colour correction": avatar.colour,

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -13,10 +13,10 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.perceptual import PerceptualSettings
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar
-from gsgan.model.discriminator import Discriminator
+from gsgan.model.discriminator import DiscriminatorSettings
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame, Window
 from gsgan.train.losses import (
@@ -65,24 +65,51 @@ def compares(
     return avatar.splats is not None and bool(step_one.perceptual)
 
 
+@dataclass(frozen=True)
+class AvatarTrainingSettings:
+    """The config group ``training``; its base file explains the keys.
+
+    Args:
+        discriminator: None, or no adversarial weight, leaves the GAN out.
+        perceptual: L_perc, built where the schedule and the weights have it; None leaves it out.
+        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
+        seed: with the iteration it determines every random number drawn here, so a resumed run
+            draws the same ones.
+        extra_losses: further terms of Step II by name: modules of a rendering and its frame.
+    """
+
+    discriminator: DiscriminatorSettings | None
+    perceptual: PerceptualSettings | None
+    schedule: Schedule
+    recipes: dict[str, Recipe]
+    step_one: StepOneLoss
+    step_two: StepTwoLoss
+    pose_noise: float
+    window: int | None
+    window_reach: float
+    seed: int
+    max_skipped: int
+    skip_window: int
+    log_every: int
+    average: float | None
+    average_every: int
+    rollback: Rollback
+    registration: Registration
+    extra_losses: dict[str, nn.Module] | None
+
+    def build(
+        self, avatar: Avatar, record: dict[str, Any], scene: dict[str, Any]
+    ) -> "AvatarTraining":
+        """The training of an avatar."""
+        return AvatarTraining(avatar, self, record, scene)
+
+
 class AvatarTraining(LightningModule):
     """Trains S, then Ψ (Step I), then generator and discriminator with Ψ (Step II).
 
     Args:
         avatar: to be trained.
-        discriminator: None, or no adversarial weight, leaves the GAN out.
-        perceptual: builds L_perc, where the schedule and the weights have it; None leaves it out.
-        schedule: iterations of each phase, see `Schedule.fit_parts`.
-        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
-        step_one, step_two: loss weights.
-        seed: with the iteration it determines every random number drawn here, so a resumed run
-            draws the same ones.
-        pose_noise, window, window_reach, max_skipped, skip_window, log_every, average,
-            average_every: see conf/training/long.yaml.
-        rollback: recovers from a collapse of the rendered person.
-        registration: of the body's surface to the training images, before the first iteration,
-            if the avatar's effects have it.
-        extra_losses: further terms of Step II by name: modules of a rendering and its frame.
+        settings: of the training.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
 
@@ -92,77 +119,69 @@ class AvatarTraining(LightningModule):
     def __init__(
         self,
         avatar: Avatar,
-        discriminator: Discriminator | None,
-        perceptual: Callable[[], Perceptual] | None,
-        schedule: Schedule,
-        recipes: dict[str, Recipe],
-        step_one: StepOneLoss,
-        step_two: StepTwoLoss,
-        *,
-        pose_noise: float,
-        window: int | None,
-        window_reach: float,
-        seed: int,
-        max_skipped: int,
-        skip_window: int,
-        log_every: int,
-        average: float | None,
-        average_every: int,
-        rollback: Rollback,
-        registration: Registration,
-        extra_losses: dict[str, nn.Module] | None = None,
-        record: dict[str, Any] | None = None,
-        scene: dict[str, Any] | None = None,
+        settings: AvatarTrainingSettings,
+        record: dict[str, Any],
+        scene: dict[str, Any],
     ) -> None:
         super().__init__()
 
         # Several optimisers take turns, so the module steps them itself.
         self.automatic_optimization = False
         self.avatar = avatar
-        self.schedule = fit_schedule(schedule, avatar)
-        self.recipes = recipes
+        self.schedule = fit_schedule(settings.schedule, avatar)
+        self.recipes = settings.recipes
 
         # The losses, with the networks that they need.
-        self.step_one = step_one
-        self.step_two = step_two
-        judges = avatar.generator is not None and step_two.adversarial_terms
-        self.discriminator = discriminator if judges else None
+        self.step_one = settings.step_one
+        self.step_two = settings.step_two
+
+        # It draws its weights also where it is left out: later parts then start alike.
+        discriminator = None
+        if settings.discriminator is not None:
+            discriminator = settings.discriminator.build()
+        adversarial = self.step_two.adversarial_terms
+        used = avatar.generator is not None and adversarial
+        self.discriminator = discriminator if used else None
         self.perceptual = None
-        if perceptual is not None and compares(avatar, step_one, step_two):
-            self.perceptual = perceptual()
-        self.extra_losses = nn.ModuleDict(extra_losses or {})
+        compared = compares(avatar, self.step_one, self.step_two)
+        if settings.perceptual is not None and compared:
+            self.perceptual = settings.perceptual.build()
+        self.extra_losses = nn.ModuleDict(settings.extra_losses or {})
 
         # Random changes of the input.
-        self.pose_noise = pose_noise
-        self.window = (
-            None if window is None else whole("training.window", window, 16)
-        )
-        self.window_reach = above("training.window_reach", window_reach)
-        self.seed = seed
+        self.pose_noise = settings.pose_noise
+        self.window = settings.window
+        if self.window is not None:
+            whole("training.window", self.window, 16)
+        reach = settings.window_reach
+        self.window_reach = above("training.window_reach", reach)
+        self.seed = settings.seed
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
 
         # Logs, and what happens where training fails.
-        self.log_every = at_least("training.log_every", log_every, 1)
-        self.skipped = SkippedSteps(max_skipped, skip_window)
-        self.rollback = rollback
+        self.log_every = at_least("training.log_every", settings.log_every, 1)
+        self.skipped = SkippedSteps(settings.max_skipped, settings.skip_window)
+        self.rollback = settings.rollback
 
         # Where the surface of training frames is; known once it is registered.
-        self.registration = registration
+        self.registration = settings.registration
         self.registered: Registered | None = None
 
         # Facts that checkpoints store.
-        self.record = record or {}
+        self.record = record
         self.scene = scene
 
         # The average of the weights is validated and scored.
         self.average = None
-        if average is not None:
-            self.average = MovingAverage(avatar, average, average_every)
+        if settings.average is not None:
+            self.average = MovingAverage(
+                avatar, settings.average, settings.average_every
+            )
 
         # A linear readout of F gives its further channels something to learn in Step I.
         self.feature_head = None
-        if step_one.feature_head and avatar.splat_channels > 3:
+        if self.step_one.feature_head and avatar.splat_channels > 3:
             self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1)
 
         # The course of the run: iterations (Lightning's global_step counts every optimiser's

@@ -8,7 +8,7 @@ from typing import Any
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.kept import FOLDER as SCORING
-from gsgan.run.stored import CHECKPOINT, drop_unread, read_checkpoint
+from gsgan.run.stored import CHECKPOINT, read_checkpoint, renew
 from gsgan.utils.errors import ConfigError
 
 PAGE = "avatar.html"
@@ -51,7 +51,7 @@ def checkpoint_to_resume(
         )
 
     # The settings must be the same; the message names the first five that differ.
-    drop_unread(state["record"])
+    renew(state["record"])
     changed = sorted(set(_differences(state["record"], now)))
     if changed:
         shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")

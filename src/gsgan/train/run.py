@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from signal import SIGTERM
-from typing import cast
+from typing import Any, Self
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
@@ -15,8 +18,7 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
-from lightning import Trainer, seed_everything
+from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
@@ -27,24 +29,20 @@ from gsgan.evaluate.origin import read_method, training_code
 from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.export.page import refuse_unsuitable
-from gsgan.export.run import export_config
+from gsgan.export.run import ExportOptions, export
+from gsgan.fit.fitter import Fit
 from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.metrics.lpips import build_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.model.harmonic import Harmonic, distil
 from gsgan.motion.clip import FPS
-from gsgan.run.assemble import (
-    build_avatar,
-    build_data,
-    moves_with_body,
-    naming_group,
-)
+from gsgan.run.assemble import RunSettings, build_avatar, naming_group
 from gsgan.run.runs import load
-from gsgan.run.stored import read_checkpoint, record
+from gsgan.run.stored import Chosen, read_checkpoint, record
 from gsgan.scene import BodyPose
 from gsgan.train.callbacks import HeldOutClip, ImageGrid, StopOnSignal
 from gsgan.train.description import describe
-from gsgan.train.module import AvatarTraining
+from gsgan.train.module import AvatarTraining, AvatarTrainingSettings
 from gsgan.train.resume import (
     PAGE,
     checkpoint_to_resume,
@@ -52,10 +50,10 @@ from gsgan.train.resume import (
     remove_old_results,
     training_record,
 )
-from gsgan.train.trainer import build_trainer, device_of, quiet_lightning
+from gsgan.train.trainer import TrainerFactory, build_trainer, quiet_lightning
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
-from gsgan.utils.config import defaults_of
+from gsgan.utils.config import CommandOptions, build, with_defaults
 from gsgan.utils.console import make_console, working
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.sweeps import STOPPED
@@ -65,45 +63,97 @@ MAX_STORED_POSES = 100  # at most, whose spread is stored: all are posed at once
 
 
 @dataclass(frozen=True)
-class TrainOptions:
-    """The keys of conf/train.yaml beside its groups.
+class LoggerFactory:
+    """The config group ``logger``.
 
     Args:
+        make: one of Lightning's loggers, with the group's keys.
+        versioned: whether it writes files, into a folder of the version's name.
+    """
+
+    make: Callable[..., Logger]
+    versioned: bool
+
+    def build(self, folder: str) -> Logger:
+        """The logger; a part of a resumed run has its own folder for files."""
+        # It would overwrite the files of an earlier part.
+        return self.make(version=folder) if self.versioned else self.make()
+
+
+@dataclass(frozen=True)
+class TrainOptions(CommandOptions):
+    """The options of gsgan.train: conf/train.yaml.
+
+    Args:
+        settings: of the avatar and its data.
+        training, fit, trainer, logger, callbacks: groups of the config.
         seed: of all random numbers.
         resume: continue an earlier part of the run in its folder.
         distil: folder of a run with Ψ from whose residuals training starts, or None.
-        scores: how the trained avatar is scored; None: it is not.
+        evaluate: score the held-out splits at the end, by ``score``.
         page: write a web page of the avatar.
+        grid_rows: of the image grid of each validation.
         max_cpu_hours: a longer run is refused; None: no limit, since the user chose the device.
+        chosen: what may watch the validation images.
+        record: plain values of the config that checkpoints hold.
     """
 
+    settings: RunSettings
+    training: AvatarTrainingSettings
+    fit: Fit
+    trainer: TrainerFactory
+    logger: LoggerFactory
+    callbacks: Sequence[Callback]
     seed: int
     resume: bool
-    distil: Path | None
-    scores: ScoreOptions | None
+    distil: str | None
+    evaluate: bool
+    score: ScoreOptions
     page: bool
+    grid_rows: int
     max_cpu_hours: float | None
+    chosen: Chosen
+    record: Mapping[str, Any]
 
     @classmethod
-    def from_config(cls, config: DictConfig) -> TrainOptions:
+    def from_config(cls, config: DictConfig) -> Self:
         """The options of a config."""
-        distil = config.distil
+        # Losses of the user's own may draw weights.
+        whole("seed", config.seed, 0)
+        torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
+
         # A device that the user chose is accepted.
         chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
         limited = not chosen and config.trainer.accelerator == "cpu"
         return cls(
+            settings=RunSettings.from_config(config),
+            training=build(config.training),
+            fit=build(config.fit),
+            trainer=TrainerFactory(
+                make=partial(build, config.trainer),
+                accelerator=config.trainer.accelerator,
+                devices=build(config.trainer.devices),
+                precision=str(config.trainer.precision),
+            ),
+            logger=LoggerFactory(
+                make=partial(build, config.logger),
+                versioned="version" in config.logger,
+            ),
+            callbacks=list(map(build, (config.callbacks or {}).values())),
             seed=config.seed,
             resume=config.resume,
-            distil=None if distil is None else Path(distil).expanduser(),
-            scores=ScoreOptions.from_config(config)
-            if config.evaluate
-            else None,
+            distil=config.distil,
+            evaluate=config.evaluate,
+            score=ScoreOptions.from_config(config),
             page=config.page,
+            grid_rows=config.grid_rows,
             max_cpu_hours=config.cpu_hours if limited else None,
+            chosen=Chosen.of(config),
+            record=record(config),
         )
 
 
-def run_training(config: DictConfig) -> None:
+def run_training(options: TrainOptions) -> None:
     """Trains, evaluates and prints where the results are.
 
     Raises:
@@ -117,13 +167,12 @@ def run_training(config: DictConfig) -> None:
     stop = StopOnSignal()
     # A black background decays into denormals, which are slow on CPUs.
     torch.set_flush_denormal(True)
-    options = TrainOptions.from_config(config)
-    if options.scores is not None:
+    if options.evaluate:
         # Missing weights fail now, not after hours of training.
-        build_lpips(options.scores.lpips_nets, options.scores.lpips_path)
+        build_lpips(options.score.lpips_nets, options.score.lpips["path"])
 
     # The data and the untrained model.
-    data, module = build_training(config, console)
+    data, module = build_training(options, console)
     if options.page:
         _refuse_page(module.avatar)
     seed_everything(options.seed, workers=True, verbose=False)
@@ -148,25 +197,25 @@ def run_training(config: DictConfig) -> None:
             return
 
     # What remains is checked, recorded and printed before the work begins.
-    device = device_of(config.trainer)
+    device = options.trainer.device
     hours = _expected_hours(options.max_cpu_hours, data, module, done, device)
     module.code = training_code()
-    precision = str(config.trainer.precision)
+    precision = options.trainer.precision
     describe(console, folder, data, module, device, precision, hours)
 
     # Training.
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     logs = "logs" if resume is None else f"logs_{done:06d}"
     trainer = build_trainer(
-        config.trainer,
+        options.trainer,
         folder,
         console,
-        logger=_logger(config.logger, logs),
+        logger=options.logger.build(logs),
         callbacks=[
             stop,
-            ImageGrid(folder / "grids", config.grid_rows),
+            ImageGrid(folder / "grids", options.grid_rows),
             HeldOutClip(folder, data.dataset(data.watched[0])),
-            *map(instantiate, (config.callbacks or {}).values()),
+            *options.callbacks,
         ],
     )
     _fit(trainer, module, data, resume, folder, console)
@@ -181,8 +230,8 @@ def run_training(config: DictConfig) -> None:
 
     # Scores and the web page.
     if trainer.is_global_zero:
-        if options.scores is not None:
-            marks = [*module.marks, *choice_marks(config, data)]
+        if options.evaluate:
+            marks = [*module.marks, *choice_marks(options.chosen, data)]
             _evaluate(trainer, module, data, options, folder, console, marks)
         if options.page:
             _write_page(folder, data)
@@ -192,30 +241,22 @@ def run_training(config: DictConfig) -> None:
 def _prepare_avatar(
     module: AvatarTraining,
     data: GsganData,
-    distil: Path | None,
+    distil: str | None,
     console: Console,
 ) -> None:
     """Starts a new run's avatar from the run ``distil``, or registers its surface to the training
     images."""
     if distil is not None:
-        start_from(module.avatar, data, distil)
+        start_from(module.avatar, data, Path(distil).expanduser())
     elif module.avatar.effects.registration.on:
         module.registered = module.registration(
             module.avatar, data.dataset("train"), console
         )
 
 
-def _logger(settings: DictConfig, folder: str) -> Logger:
-    """The logger of the config group; a part of a resumed run has its own folder for files."""
-    # It would overwrite the files of an earlier part.
-    version = {"version": folder} if "version" in settings else {}
-    logger: Logger = instantiate(settings, **version)
-    return logger
-
-
 def _has_results(options: TrainOptions, folder: Path, checkpoint: Path) -> bool:
     """Whether the results that the options ask for are newer than the checkpoint."""
-    scored = options.scores is None or is_written(
+    scored = not options.evaluate or is_written(
         folder / "metrics.json", checkpoint
     )
     return scored and (
@@ -224,43 +265,41 @@ def _has_results(options: TrainOptions, folder: Path, checkpoint: Path) -> bool:
 
 
 def build_training(
-    config: DictConfig, console: Console | None = None
+    options: TrainOptions, console: Console | None = None
 ) -> tuple[GsganData, AvatarTraining]:
-    """Data and training module of a config; ``console`` shows what takes long.
+    """Data and training module; ``console`` shows what takes long.
 
     Raises:
         GsganError: on a dataset or a value that cannot be used.
     """
     # The data, whose body is fitted first where the avatar needs one that the data lacks.
-    whole("seed", config.seed, 0)
     console = console or Console(quiet=True)
     with working(console, "reading the data"):
-        data = build_data(config)
+        data = copy(options.settings.data).read()
     if HydraConfig.initialized():
         given = HydraConfig.get().overrides.task
         of_fit = [word for word in given if word.startswith(("fit.", "fit="))]
-        refuse_other_fit(data, instantiate(config.fit), of_fit)
-    if data.lacks_body and moves_with_body(config):
-        fit_before_training(
-            data, instantiate(config.fit), device_of(config.trainer)
-        )
+        refuse_other_fit(data, options.fit, of_fit)
+    if data.lacks_body and options.settings.avatar.moves_with_body:
+        fit_before_training(data, options.fit, options.trainer.device)
         with working(console, "reading the data with its body"):
-            data = build_data(config)
+            data = copy(options.settings.data).read()
 
     # The avatar, and the spread of the training poses, beyond which it extrapolates.
     with working(console, "measuring the scene"):
         info = data.info
     with working(console, "building the avatar"):
-        avatar = build_avatar(config, info, data.select_labelled("train"))
+        images = data.select_labelled("train")
+        avatar = build_avatar(options.settings.avatar, info, images)
         _store_poses(avatar, data)
     # the same start beside every avatar
-    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
+    torch.manual_seed(options.seed + DISCRIMINATOR_SALT)
 
     # The training, with the settings that checkpoints store.
     with naming_group("training"):
-        return data, instantiate(config.training)(
+        return data, options.training.build(
             avatar,
-            record=training_record(record(config), data),
+            record=training_record(options.record, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
 
@@ -343,9 +382,7 @@ def _write_page(folder: Path, data: GsganData) -> None:
         "overwrite": True,
     }
     given |= {"motion": "train", "fps": data.layout.meta.fps or FPS}
-    export_config(
-        cast(DictConfig, OmegaConf.merge(defaults_of("export"), given))
-    )
+    export(ExportOptions.from_config(with_defaults("export", given)))
 
 
 def _fit(
@@ -402,10 +439,9 @@ def _evaluate(
 
     # The average of the weights is scored, if there is one.
     avatar = module.shown.eval()
-    assert options.scores is not None
     evaluate_method(
         folder,
-        options.scores,
+        options.score,
         console,
         data,
         predict=painter(avatar),

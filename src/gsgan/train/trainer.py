@@ -3,7 +3,8 @@
 import logging
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,9 @@ import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
 # isort: split
 import torch
-from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from gsgan.run.stored import CHECKPOINT
@@ -29,8 +28,36 @@ from gsgan.train.callbacks import (
 LOCAL_RANKS = ("LOCAL_RANK", "SLURM_LOCALID")
 
 
+@dataclass(frozen=True)
+class TrainerFactory:
+    """The config group ``trainer``.
+
+    Args:
+        make: Lightning's Trainer, with the group's keys.
+        accelerator, devices, precision: keys of the group.
+    """
+
+    make: Callable[..., Trainer]
+    accelerator: str
+    devices: int | str | Sequence[int]
+    precision: str
+
+    @property
+    def device(self) -> torch.device:
+        """The device on which Lightning will put the model of this process."""
+        if self.accelerator == "cpu" or not torch.cuda.is_available():
+            return torch.device("cpu")
+
+        # The launcher's rank of a process picks its GPU.
+        ranks = (os.environ.get(name) for name in LOCAL_RANKS)
+        rank = int(next(filter(None, ranks), 0))
+        if isinstance(self.devices, list):
+            rank = self.devices[rank]
+        return torch.device("cuda", rank)
+
+
 def build_trainer(
-    settings: DictConfig,
+    factory: TrainerFactory,
     folder: Path,
     console: Console,
     logger: Logger | None,
@@ -39,7 +66,7 @@ def build_trainer(
     """The Trainer of a run, as long as the schedule.
 
     Args:
-        settings: the config group ``trainer``.
+        factory: of the config group ``trainer``.
         folder: of the run.
         console: for progress.
         logger: of the curves.
@@ -62,28 +89,13 @@ def build_trainer(
         used.append(RichProgressBar())
 
     # `WholeSchedule` sets the number of epochs.
-    return instantiate(
-        settings,
+    return factory.make(
         max_epochs=-1,
         callbacks=used,
         default_root_dir=folder,
         plugins=[AtomicCheckpoints()],
         logger=logger,
         enable_progress_bar=console.is_terminal,
-    )
-
-
-def device_of(settings: DictConfig) -> torch.device:
-    """Where Lightning will put the model of a process, by the config group ``trainer``."""
-    if settings.accelerator == "cpu" or not torch.cuda.is_available():
-        return torch.device("cpu")
-
-    # The launcher's rank of a process picks its GPU.
-    ranks = (os.environ.get(name) for name in LOCAL_RANKS)
-    rank = int(next(filter(None, ranks), 0))
-    chosen = settings.devices
-    return torch.device(
-        "cuda", chosen[rank] if OmegaConf.is_list(chosen) else rank
     )
 
 

@@ -8,9 +8,10 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, get_type_hints
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
@@ -22,7 +23,7 @@ from hydra.errors import (
 )
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
-from hydra.utils import get_method
+from hydra.utils import get_class, get_method, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
@@ -137,6 +138,60 @@ def defaults_of(command: str) -> DictConfig:
     return options
 
 
+def with_defaults(command: str, given: Mapping[str, Any]) -> DictConfig:
+    """The options of a command, its defaults where none are given."""
+    options = defaults_of(command)
+    options.merge_with(given)
+    return options
+
+
+class CommandOptions:
+    """Options of a command: a dataclass whose fields have the names of keys in its config.
+
+    A group of the config is built as its ``_target_`` says. A field that is a class of options
+    itself takes its values from the same config.
+    """
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> Self:
+        """The options of a config; those that it lacks take their defaults.
+
+        Raises:
+            GsganError: on a value that does not fit.
+        """
+        assert is_dataclass(cls)
+        kinds = get_type_hints(cls)
+        values: dict[str, Any] = {}
+        for field in fields(cls):
+            name = field.name
+            kind = kinds[name]
+            if isinstance(kind, type) and issubclass(kind, CommandOptions):
+                values[name] = kind.from_config(config)
+            elif name in config:
+                values[name] = build(config[name])
+        return cls(**values)
+
+
+def build(value: Any, **further: Any) -> Any:
+    """A value of a config as plain values, or as what it names with ``_target_``.
+
+    Args:
+        value: of a config.
+        further: arguments of what it names.
+
+    Raises:
+        GsganError: when its constructor refuses it.
+    """
+    if not OmegaConf.is_config(value):
+        return value
+    try:
+        return instantiate(value, _convert_="all", **further)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, GsganError):
+            raise error.__cause__ from None
+        raise ConfigError(str(one_sentence(error))) from error
+
+
 def refuse_words_for_truth(config: DictConfig, defaults: DictConfig) -> None:
     """Refuses words such as ``no`` where the default is true or false: they would count as true."""
     for key, default in flat(OmegaConf.to_container(defaults, resolve=False)):
@@ -244,16 +299,15 @@ OmegaConf.register_new_resolver("gpu_precision", gpu_precision, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
-def entry(
-    name: str, task: Callable[[DictConfig], object] | str
-) -> Callable[[], None]:
+def entry(name: str, task: str, options: str) -> Callable[[], None]:
     """A command with Hydra's grammar and one-sentence errors.
 
     Each job of a sweep (``-m``) is the same command in a process of its own.
 
     Args:
         name: of the config file, without ``.yaml``, and of the command.
-        task: a function of the config, or its full name, which is imported when the command runs.
+        task: the full name of a function of the options, which is imported when the command runs.
+        options: the full name of its class of `CommandOptions`.
     """
 
     def run(config: DictConfig) -> float | None:
@@ -271,7 +325,8 @@ def entry(
             plain = OmegaConf.to_container(config, resolve=False)
             refuse_gone(dict(flat(plain)))
             paths_as_text(config)
-            (get_method(task) if isinstance(task, str) else task)(config)
+            kind: type[CommandOptions] = get_class(options)
+            get_method(task)(kind.from_config(config))
         except KeyboardInterrupt:
             _print_error("interrupted")
             sys.exit(130)

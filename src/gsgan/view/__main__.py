@@ -2,7 +2,11 @@
 
 from gsgan.utils.config import entry
 
-main = entry("view", "gsgan.view.server.view_config")
+main = entry(
+    "view",
+    task="gsgan.view.server.view",
+    options="gsgan.view.server.ViewOptions",
+)
 
 if __name__ == "__main__":
     main()

@@ -6,12 +6,11 @@ import logging
 import re
 import socket
 import threading
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from gsgan.motion.orbit import Orbit
 from gsgan.run.drive import (
@@ -22,9 +21,10 @@ from gsgan.run.drive import (
     drive_of,
     smooth,
 )
-from gsgan.run.runs import Run
+from gsgan.run.runs import RunReference
 from gsgan.skeleton.proportions import upright
 from gsgan.utils.checks import above, between, whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.images import background
@@ -44,14 +44,32 @@ ORIGIN = r"https?://[^/\s]+/?"
 MAX_UPLOADS = 8  # of a browser at the same time
 
 
-def view_config(config: DictConfig) -> None:
+@dataclass(frozen=True)
+class ViewOptions(CommandOptions):
+    """The options of gsgan.view: conf/view.yaml."""
+
+    source: RunReference
+    driven: MotionOptions
+    fps: float
+    smooth: Mapping[str, Any]
+    background: str | int
+    pixels: int | None
+    rate: float
+    host: str
+    origin: str | None
+    port: int
+    max_upload: float
+    distilled: bool
+
+
+def view(options: ViewOptions) -> None:
     """Serves until interrupted.
 
     Raises:
         ConfigError: when an option has an invalid value, or viser is missing.
         DataError: when the run or the motion cannot be read.
     """
-    viewer = Viewer(config)
+    viewer = Viewer(options)
     console = make_console()
     console.print(viewer.show.drive.text, markup=False, highlight=False)
     console.print(
@@ -69,30 +87,31 @@ class Viewer:
     """A server of one avatar.
 
     Args:
-        config: the options of conf/view.yaml.
+        options: what it shows, and where.
     """
 
-    def __init__(self, config: DictConfig) -> None:
+    def __init__(self, options: ViewOptions) -> None:
         # The avatar.
         viser = import_viser()
-        options = MotionOptions.from_config(config)
-        self.run = Run.from_config(config)
-        fps = float(above("fps", config.fps))
-        if config.distilled:
-            self.run.avatar = distil_run(options, self.run)
+        self.run = options.source.load()
+        fps = float(above("fps", options.fps))
+        if options.distilled:
+            self.run.avatar = distil_run(options.driven, self.run)
 
-        def read(motion: str) -> Drive:
-            chosen = replace(options, motion=motion)
+        def read(motion: str | list[str]) -> Drive:
+            chosen = replace(options.driven, motion=motion)
             drive = drive_of(chosen, self.run, fps)
-            return smooth(config.smooth, drive, fps)
+            return smooth(options.smooth, drive, fps)
 
         # The settings and the first motion of all browsers.
         first = REST if self.run.is_shared else self.run.data.watched[0]
-        drive = read(config.motion or first)
+        drive = read(options.driven.motion or first)
         size = whole(
-            "pixels", config.pixels or self.run.stored.data.size or 512, 16
+            "pixels",
+            options.pixels or self.run.trained_as.image_size or 512,
+            16,
         )
-        behind: Any = background(str(config.background), video=True)
+        behind: Any = background(str(options.background), video=True)
         self.show = Show(
             avatar=self.run.avatar,
             body=self.run.body,
@@ -101,19 +120,19 @@ class Viewer:
             behind=behind,
             size=size,
             fps=fps,
-            rate=float(above("rate", config.rate)),
+            rate=float(above("rate", options.rate)),
         )
 
         # The page's address behind a proxy.
-        origin = None if config.origin is None else str(config.origin)
+        origin = None if options.origin is None else str(options.origin)
         if origin is not None and not re.fullmatch(ORIGIN, origin):
             raise ConfigError(
                 f"origin must be the beginning of an address, such as https://name, got {origin!r}"
             )
 
         # With an address of another machine, viser would never return.
-        host = str(config.host)
-        port = between("port", whole("port", config.port, 0), 0, 65535)
+        host = str(options.host)
+        port = between("port", whole("port", options.port, 0), 0, 65535)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             socket.create_server((host, 0), family=family).close()
@@ -139,7 +158,7 @@ class Viewer:
         self._camera(size)
 
         # A session per browser, and one thread that renders for all.
-        self._limit = int(above("max_upload", config.max_upload) * MEGABYTE)
+        self._limit = int(above("max_upload", options.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
         self._wake = threading.Event()
         self._ended = False
@@ -188,7 +207,7 @@ class Viewer:
         p = self.show.drive.p
         orbit = Orbit()
         proportions = self.run.proportions
-        trained = self.run.stored.data.size or size
+        trained = self.run.trained_as.image_size or size
         camera = orbit.cameras(
             p[:1], proportions, self.run.scene, size, trained
         )

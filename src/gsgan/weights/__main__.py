@@ -1,11 +1,21 @@
 """``python -m gsgan.weights``: list the pretrained weights, and get those that are missing."""
 
-from omegaconf import DictConfig
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from gsgan.utils.config import entry
+from gsgan.utils.config import CommandOptions, entry
 
 
-def list_weights(config: DictConfig) -> None:
+@dataclass(frozen=True)
+class WeightsOptions(CommandOptions):
+    """The options of gsgan.weights: conf/weights.yaml."""
+
+    nets: Sequence[str]
+    path: str | None
+    download: bool
+
+
+def list_weights(options: WeightsOptions) -> None:
     """Prints where each network's weights are found, and downloads those that are missing.
 
     Raises:
@@ -19,12 +29,12 @@ def list_weights(config: DictConfig) -> None:
 
     console = make_console()
     problems = []
-    for net in config.nets:
+    for net in options.nets:
         # On this machine, or else downloaded.
         title = files.network_of(net).title
         try:
-            path = files.find(net, config.path)
-            if path is None and config.download:
+            path = files.find(net, options.path)
+            if path is None and options.download:
                 path = files.get(net)
             if path is None:
                 raise DataError(
@@ -44,7 +54,11 @@ def list_weights(config: DictConfig) -> None:
         raise DataError("; ".join(problems))
 
 
-main = entry("weights", list_weights)
+main = entry(
+    "weights",
+    task="gsgan.weights.__main__.list_weights",
+    options="gsgan.weights.__main__.WeightsOptions",
+)
 
 if __name__ == "__main__":
     main()

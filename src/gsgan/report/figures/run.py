@@ -3,8 +3,8 @@
 import io
 import json
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 import matplotlib
 import torch
 from matplotlib.patches import Rectangle
-from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 from torch import Tensor
 from torch.nn import functional
@@ -36,8 +35,10 @@ from gsgan.report.figures.subjects import (
     measure,
     open_subjects,
 )
-from gsgan.run.stored import DataPaths, load_config
+from gsgan.run.runs import RunReference
+from gsgan.run.stored import load_config
 from gsgan.utils.checks import at_least, one_of, whole
+from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -182,27 +183,42 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
 COMPARE = ("comparison", "ablation")  # figures that need a second run
 
 
-def make_figures(config: DictConfig) -> None:
-    """Draws the figures of ``config`` and writes images, captions and numbers into ``out``.
+@dataclass(frozen=True)
+class FigureOptions(CommandOptions):
+    """The options of figures: conf/report.yaml."""
+
+    source: RunReference
+    compare: str | Sequence[str] | None
+    figures: str | Sequence[str] | None
+    split: str
+    frames: int | Sequence[int] | None
+    camera: str | int | None
+    shots: Mapping[str, int]
+    margin: float
+    out: str | None
+
+
+def make_figures(options: FigureOptions) -> None:
+    """Draws figures and writes images, captions and numbers into ``out``.
 
     Raises:
         ConfigError: on a wrong value, runs of different data, or a comparison of one run.
         DataError: when a run or its data cannot be read.
     """
     # The first run leads; its folder gets the figures by default.
-    given = (config.run, *_list(config.compare))
+    given = (options.source.run, *_list(options.compare))
     folders = [Path(str(folder)).expanduser() for folder in given]
 
-    names = _names(config, alone=len(folders) < 2)
-    at_least("margin", config.margin, 0)
+    names = _names(options, alone=len(folders) < 2)
+    at_least("margin", options.margin, 0)
 
     # Other folders are refused before anything is written.
     out = folders[0] / "figures"
-    if config.out is not None:
-        out = Path(config.out).expanduser()
+    if options.out is not None:
+        out = Path(options.out).expanduser()
 
     # Every run's config is read before the first avatar is loaded.
-    moved = DataPaths.from_config(config)
+    moved = options.source.paths
     for folder in folders:
         load_config(folder, moved)
     try:
@@ -214,12 +230,12 @@ def make_figures(config: DictConfig) -> None:
 
     # Each figure is written as soon as it is drawn. fontTools logs every glyph of a PDF.
     logging.getLogger("fontTools").setLevel(logging.WARNING)
-    subjects = open_subjects(folders, moved, pick_device(config.device))
+    subjects = open_subjects(folders, moved, pick_device(options.source.device))
     console = make_console()
     made = dict[str, Drawing]()
     with matplotlib.rc_context(STYLE):
         for name in track(names, "drawing", console=console, transient=True):
-            drawing = _draw(name, subjects, config)
+            drawing = _draw(name, subjects, options)
             made[name] = drawing
 
             # Vectors for print and pixels for pages, without a date: files of
@@ -251,9 +267,9 @@ def make_figures(config: DictConfig) -> None:
     )
 
 
-def _names(config: DictConfig, *, alone: bool) -> list[str]:
+def _names(options: FigureOptions, *, alone: bool) -> list[str]:
     """The figures to draw, each once; by default all, but none that compares a run ``alone``."""
-    names = list(dict.fromkeys(_list(config.figures)))
+    names = list(dict.fromkeys(_list(options.figures)))
     for name in names:
         one_of("figures", name, FIGURES)
         if alone and name in COMPARE:
@@ -267,42 +283,41 @@ def _names(config: DictConfig, *, alone: bool) -> list[str]:
 
 
 def _draw(
-    name: str, subjects: Sequence[Subject], config: DictConfig
+    name: str, subjects: Sequence[Subject], options: FigureOptions
 ) -> Drawing:
     """One figure with its whole caption."""
     # All runs are of the data of the first one.
     data = subjects[0].data
-    split = config.split
+    split = options.split
 
     # Options are checked here, since each figure has its own number of shots.
-    frames = list(dict.fromkeys(_list(config.frames)))
+    frames = list(dict.fromkeys(_list(options.frames)))
     for frame in frames:
         whole("frames", frame, 0)
     items = choose_items(
         data,
         split,
         frames=frames or None,
-        camera=None if config.camera is None else str(config.camera),
-        count=whole(f"shots.{name}", config.shots.get(name), 1),
+        camera=None if options.camera is None else str(options.camera),
+        count=whole(f"shots.{name}", options.shots.get(name), 1),
         one_camera=name == "strip",
     )
 
     # The caption names the images, and says what the numbers are of.
-    shots = make_shots(data, split, items, config.margin)
+    shots = make_shots(data, split, items, options.margin)
     drawing = FIGURES[name](subjects, shots)
     images = ", ".join(shot.name for shot in shots)
     about = (
         f" Images: {images}. Numbers are of the windows shown, "
-        f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
+        f"which reach at least {options.margin:g} m beyond the joints, not of whole images."
     )
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
 def _list(value: Any) -> list[Any]:
     """A list as it is, one value as a list of one, null as none."""
-    # An option may be a list, one value or null.
-    if OmegaConf.is_list(value):
-        return list(value)
+    if isinstance(value, list):
+        return value
     return [] if value is None else [value]
 
 

@@ -15,7 +15,7 @@ from gsgan.evaluate.origin import fingerprint
 from gsgan.metrics.image import edge_f1, psnr
 from gsgan.model.avatar import Avatar
 from gsgan.report.runs import DATA, NAME, ScoredRun, check_same, read_run
-from gsgan.run.assemble import build_data
+from gsgan.run.assemble import RunSettings
 from gsgan.run.runs import load_avatar
 from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame, Window, body_window, cat
@@ -213,14 +213,14 @@ def _open(
     folder: Path, moved: DataPaths, device: torch.device | str
 ) -> Subject:
     # The run's seed and data are those of the config that is opened.
-    config = load_config(folder, moved)
-    data = build_data(config)
-    avatar, marks = load_avatar(folder, config, data)
+    settings = RunSettings.from_config(load_config(folder, moved))
+    data = settings.data.read()
+    avatar, marks = load_avatar(folder, settings.avatar, data)
     run = read_run(folder, scored=False)
     facts = run.data | {"fingerprint": fingerprint(data)}
 
     # The figures' data may differ from those of the scores.
-    run = replace(run, seed=config.seed, data=facts)
+    run = replace(run, seed=settings.avatar.seed, data=facts)
     name = TITLES.get(run.name, run.name)
     if run.name == "full" and run.departures == []:
         name = NAME
