@@ -30,7 +30,7 @@ pytestmark = [
     not (DATA / "balance_videos").is_dir(), reason="no balance videos"
 )
 def test_real_videos_become_a_capture_that_trains(tmp_path, check):
-    """The calibration is a degree or two off; the joints end within 6 px of the detections."""
+    """The calibration is a degree or two off; points end within 6 px of the detections, a body within 8."""
     source = DATA / "balance_videos"
     given = Options(str(source), str(tmp_path / "out"))
     out = prepare(given, Console(file=io.StringIO()))
@@ -38,7 +38,9 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     error = numbers["error_px"]
     assert error["plain"] > 12
     assert error["plain"] > error["robust"] > error["flips"] > error["refined"]
-    assert error["body"] < 6
+    # Limbs of constant length are farther from the detections than free points.
+    assert error["refined"] < 6
+    assert error["body"] < 8
     assert (
         max(
             camera["error_px"]["body"] for camera in numbers["cameras"].values()
