@@ -279,3 +279,9 @@ def test_empty_files_are_called_empty(tmp_path, name):
 def test_times_beside_the_number_of_the_frame_do_not_count():
     stems = [f"{k:06d}_{1698765000 + 33 * k}" for k in range(3)]
     assert list(map(counting(stems), stems)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("name", ["{:06d}_0", "frame{:04d}_cam1", "{}"])
+def test_the_number_that_differs_counts_frames(name):
+    stems = [name.format(frame) for frame in (0, 1, 10)]
+    assert list(map(counting(stems), stems)) == [0, 1, 10]
