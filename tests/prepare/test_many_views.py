@@ -50,6 +50,16 @@ def test_frames_without_a_trunk_stay_missing():
     assert np.isfinite(np.delete(found, 4, axis=0)).all()
 
 
+def test_legs_outside_every_image_stay_missing_and_the_upper_body_is_solved():
+    p = skeletons(20)
+    weight = np.ones((4, 20, 33))
+    weight[:, :, 23:] = 0
+    _, found = solved(1.0, p, weight)
+    assert np.isnan(found[:, 23:]).all()
+    error = np.linalg.norm(found - p, axis=-1)[:, :23]
+    assert np.median(error) < 0.02
+
+
 def test_a_cut_is_a_gap_in_time_and_quick_motion_is_none():
     p = torch.from_numpy(skeletons(20))
     time = torch.arange(20, dtype=torch.float64) / 5

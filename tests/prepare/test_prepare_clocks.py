@@ -232,7 +232,7 @@ def test_late_clocks_are_measured_to_a_tenth_of_a_frame(late):
     [
         (2.4, None, True),
         (-0.95, None, True),
-        (-0.75, None, False),  # as those of Pose2Sim's synchronised videos seem
+        (-0.75, None, False),  # as in Pose2Sim's videos
         (0.4, None, False),
         (0.6, {"b": 2}, False),  # what whole offsets may leave
         (1.6, {"b": 2}, True),

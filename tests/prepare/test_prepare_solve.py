@@ -276,6 +276,19 @@ def test_a_disturbed_calibration_comes_back_within_half_a_pixel(moved):
     assert np.median(seen_again.error) < 0.5
 
 
+def test_landmarks_refuse_cameras_that_wrong_silhouettes_would_turn():
+    """One camera's silhouettes are of something else than the person alone."""
+    rig, _, uv, conf = seen(ring(), frames=30)
+    shown = uv.copy()
+    shown[1] += (12, 25)
+    noise = np.random.default_rng(3).normal(0, 0.5, uv.shape)
+    found = found_by(rig, uv + noise, conf, outlines(shown, noise=0.3))
+    turned_by, moved = camera_moves(rig, found.cameras)
+    assert found.frontier[0] > 2
+    assert turned_by.max() < 0.5
+    assert moved.max() < 20
+
+
 def test_without_silhouettes_the_given_cameras_are_kept():
     rig, uv, conf, _ = biased_scene(frames=8)
     given = turned(rig, 1, degrees=1.0, metres=0.03)

@@ -169,13 +169,16 @@ def _by_words(
     words = [SEPARATOR.split(stem) for stem in stems]
     if len({len(parts) for parts in words}) != 1:
         return []
+
+    # Two words differ: one names the camera, the other counts.
     columns = [
         column for column in zip(*words, strict=True) if len(set(column)) > 1
     ]
+    if len(columns) != 2:
+        return []
     ways = []
     for names, moments in permutations(columns, 2):
-        counted = len(columns) == 2 and all(map(str.isdigit, moments))
-        if counted and len(set(names)) < len(views):
+        if all(map(str.isdigit, moments)) and len(set(names)) < len(views):
             ways.append(_group(names, views))
     return ways
 
@@ -471,15 +474,14 @@ def _nerfstudio_lens(where: str, values: Mapping[str, Any]) -> Lens:
     unsized = not {"w", "h"} & set(values)
     in_pixels = unsized and not PIXEL_KEYS.isdisjoint(values)
     by_angle = "camera_angle_x" in values and not in_pixels
-    shares = unsized and by_angle
     width = height = 1.0
-    if not unsized or not (in_pixels or by_angle):
+    if not (in_pixels or (unsized and by_angle)):
         width = value("w")
         height = value("h")
 
     # The focal length, or the angle of view that gives it. Without a second one, pixels are square.
     focal = None
-    if "camera_angle_x" in values and (shares or not unsized):
+    if by_angle:
         focal = width / 2 / np.tan(value("camera_angle_x") / 2)
     fx = value("fl_x", focal)
 

@@ -89,10 +89,8 @@ MESHCAPADE_KEYS = {
     "frameRate": "fps",
 }
 FIT_KEYS = ("Rh", "Th", "poses", "shapes")
-NOBODY: tuple[Any, ...] = (
-    [],
-    {"annots": []},
-)  # frames of EasyMocap without a person
+# Frames of EasyMocap without a person.
+NOBODY: tuple[Any, ...] = ([], {"annots": []})
 EASYMOCAP_SMPLX = 87  # SMPL-X's body, 6 numbers for each hand, jaw and eyes
 SMPLH_COUNTS = (52, 6890)  # joints and vertices of SMPL-H
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")

@@ -333,10 +333,10 @@ def refine(
         if (_landmark_errors(cameras, found) > limit).any():
             continue
         after = float(np.nanmedian(frontier_points(cameras, judging).error))
-        if not after >= lowest:
+        if np.isnan(lowest) or after < lowest:
             best = cameras
             lowest = after
-    if lowest > BETTER * error:
+    if not lowest <= BETTER * error:
         best = given
     return Refined(best, (error, lowest))
 

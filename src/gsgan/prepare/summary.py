@@ -17,8 +17,8 @@ from gsgan.utils.arrays import Float
 
 TURNED = 1e-4  # degrees: less is rounding of cameras that were kept
 DELAY = 0.5  # frames: larger delays of a clock are noted
-# Frames: a clock that is so late is an error. Whole offsets leave half a frame, and landmarks of
-# synchronised videos seem up to 0.75 frames late.
+# Frames: a clock that is so late is an error. Whole offsets leave half a frame, and landmarks
+# themselves can make a clock seem three quarters of one late.
 LATE = 0.9
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
 
