@@ -227,9 +227,9 @@ def test_the_image_is_saved(open_page):
     with page.expect_download() as got:
         page.get_by_text("save the image").click()
     content = got.value.path().read_bytes()
-    np.testing.assert_array_equal(
-        np.asarray(Image.open(BytesIO(content))), session.image
-    )
+    until(lambda: session.full, page)
+    saved = np.asarray(Image.open(BytesIO(content)))
+    np.testing.assert_array_equal(saved, session.image)
     assert b"trainedAlgorithmicMedia" in content
 
 

@@ -75,6 +75,7 @@ class Session:
         self.moved = self.changed
         self.started = 0.0  # when rendering of the current image began
         self.full = False  # whether the current image is of full size
+        self.saving = False  # whether the next image is saved
         self.seconds = 0.0  # to render a full-size image
         self.times: deque[float] = deque(maxlen=200)  # of the last images
         self.image: Bytes | None = None
@@ -132,7 +133,7 @@ class Session:
         self.slider.on_update(self._on_scrub)
         upload.on_upload(lambda event: self._load(event.target.value))
         reset.on_click(lambda _: self._scrub(self.frame))
-        save.on_click(lambda _: self._save())
+        save.on_click(lambda _: self._on_save())
         self.client.camera.on_update(lambda _: self.touch())
 
     def touch(self, moving: bool = True) -> None:
@@ -178,11 +179,16 @@ class Session:
         self.slider.value = 0
         self._scrub(0)
 
-    def _save(self) -> None:
-        if self.image is not None:
-            name = f"gsgan_{self.frame:06d}.png"
-            content = png_bytes(Image.fromarray(self.image))
-            self.client.send_file_download(name, content, save_immediately=True)
+    def _on_save(self) -> None:
+        # What is saved is of full size, also while the motion plays.
+        self.saving = True
+        self.touch(moving=False)
+
+    def _save(self, image: Bytes) -> None:
+        self.saving = False
+        name = f"gsgan_{self.frame:06d}.png"
+        content = png_bytes(Image.fromarray(image))
+        self.client.send_file_download(name, content, save_immediately=True)
 
     # -- dragging
 
@@ -269,7 +275,7 @@ class Session:
 
         # The time of an image is proportional to its area.
         share = 1.0
-        if moving and self.seconds:
+        if moving and self.seconds and not self.saving:
             fast_enough = (1 / self.show.rate / self.seconds) ** 0.5
             share = min(1.0, max(MIN_SCALE, fast_enough))
         self.started = now
@@ -290,6 +296,8 @@ class Session:
             return IDLE_SECONDS
         self._problem = ""
         self.full = share == 1
+        if self.saving and self.full and self.image is not None:
+            self._save(self.image)
 
         # A running mean of the time of a full-size image.
         took = time.monotonic() - now
