@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from gsgan.utils.errors import DataError
 from gsgan.weights.files import (
@@ -99,6 +100,9 @@ def load_pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
     for tap in TAPS[net]:
         stages.append(layers[start : tap + 1])
         start = tap + 1
+
+    # A processor convolves and pools fastest where a pixel's channels lie together.
+    convert_conv2d_weight_memory_format(stages, torch.channels_last)
     return FeatureNetwork(stages)
 
 

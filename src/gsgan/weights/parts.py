@@ -2,7 +2,8 @@
 
 Elsewhere the features are those of an image of the background alone, which is computed once. A
 layer's output can only differ where its windows reach a difference of its input, so each layer is
-computed there, and reads what lies around from the background's maps.
+computed there, in strips that are as wide as the differences in them, and reads what lies around
+from the background's maps.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-Span = tuple[
-    int, int
-]  # the first row or column, and the first one after the last
+# The first row or column, and the first one after the last.
+Span = tuple[int, int]
+# Rows of a strip, at least 1: lower strips follow an outline better and run slower.
+STRIP = 32
 
 
 class MapPart(NamedTuple):
@@ -25,11 +27,13 @@ class MapPart(NamedTuple):
     Args:
         values: ``[1, C, h, w]`` in these rows and columns.
         rows, columns: of the map.
+        differs: ``[1, 1, H, W]``, 1 where the whole map may differ from the background's.
     """
 
     values: Tensor
     rows: Span
     columns: Span
+    differs: Tensor
 
 
 class BackgroundMaps:
@@ -45,14 +49,16 @@ class BackgroundMaps:
         self.stages = stages
         self.image = image
 
-        # The input of each layer, and the maps after each stage.
+        # The input and the output of each layer, and the maps after each stage.
         self.inputs: dict[nn.Module, Tensor] = {}
+        self.outputs: dict[nn.Module, Tensor] = {}
         self.maps = []
         values = image
         for stage in stages:
             for layer in stage.children():
                 self.inputs[layer] = values
                 values = layer(values)
+                self.outputs[layer] = values
             self.maps.append(values)
 
     @torch.no_grad()
@@ -60,12 +66,13 @@ class BackgroundMaps:
         """The part of each map of an image in which it may differ from the background's; an empty
         list for an image that equals the background."""
         # The smallest rectangle around all pixels that differ.
-        differs = (image != self.image)[0].any(dim=0)
+        differs = (image != self.image).any(dim=1, keepdim=True)
         if not differs.any():
             return []
-        rows = _span(differs.any(dim=1))
-        columns = _span(differs.any(dim=0))
-        part = MapPart(_cut(image, rows, columns), rows, columns)
+        rows = _span(differs.any(dim=3))
+        columns = _span(differs.any(dim=2))
+        values = _cut(image, rows, columns)
+        part = MapPart(values, rows, columns, differs.float())
 
         # Each layer continues from the part of the one before.
         parts = []
@@ -99,17 +106,38 @@ class BackgroundMaps:
         before = self.inputs[layer]
         rows, read_rows = _reach(layer, part.rows, before.shape[-2])
         columns, read_columns = _reach(layer, part.columns, before.shape[-1])
-        values = _cut(before, read_rows, read_columns)
-        values = _paste(values, part, read_rows[0], read_columns[0])
+        read = _cut(before, read_rows, read_columns)
+        read = _paste(read, part, read_rows[0], read_columns[0])
+
+        # The outputs whose windows hold a difference; the others are the background's.
+        window = _window(layer)
+        differs = functional.max_pool2d(part.differs, *window)
+        where = _cut(differs, rows, columns) > 0
+        values = _cut(self.outputs[layer], rows, columns).clone()
 
         # The padding is in what is read already.
-        if isinstance(layer, nn.Conv2d):
-            values = functional.conv2d(
-                values, layer.weight, layer.bias, layer.stride
-            )
-        else:
-            values = layer(values)
-        return MapPart(values, rows, columns)
+        kernel, stride, _ = window
+        for top in range(0, rows[1] - rows[0], STRIP):
+            strip = where[:, :, top : top + STRIP]
+            if not strip.any():
+                continue
+            left, right = _span(strip.any(dim=2))
+            bottom = top + strip.shape[2]
+            inputs = read[
+                ...,
+                top * stride : (bottom - 1) * stride + kernel,
+                left * stride : (right - 1) * stride + kernel,
+            ]
+            outputs = values[..., top:bottom, left:right]
+            outputs.copy_(_without_padding(layer, inputs))
+        return MapPart(values, rows, columns, differs)
+
+
+def _without_padding(layer: nn.Module, values: Tensor) -> Tensor:
+    """A layer's output for inputs that hold its padding."""
+    if isinstance(layer, nn.Conv2d):
+        return functional.conv2d(values, layer.weight, layer.bias, layer.stride)
+    return layer(values)
 
 
 def union(spans: Sequence[Span]) -> Span:
@@ -118,22 +146,30 @@ def union(spans: Sequence[Span]) -> Span:
 
 
 def _span(marked: Tensor) -> Span:
-    """From the first to the last marked place ``[n]``."""
-    places = marked.nonzero().flatten().tolist()
+    """From the first to the last of the marked places."""
+    places = marked.flatten().nonzero().flatten().tolist()
     return places[0], places[-1] + 1
 
 
-def _number(setting: int | tuple[int, ...] | str) -> int:
-    """A setting of a layer, equal for rows and columns."""
-    return int(setting[0] if isinstance(setting, tuple) else setting)
+class Window(NamedTuple):
+    """What a layer reads, equal for rows and columns."""
+
+    kernel: int
+    stride: int
+    padding: int
+
+
+def _window(layer: nn.Module) -> Window:
+    """The window of a convolution or a pooling."""
+    assert isinstance(layer, nn.Conv2d | nn.MaxPool2d)
+    settings = (layer.kernel_size, layer.stride, layer.padding)
+    sides = [x[0] if isinstance(x, tuple) else x for x in settings]
+    return Window(*map(int, sides))
 
 
 def _reach(layer: nn.Module, span: Span, length: int) -> tuple[Span, Span]:
     """The outputs whose windows read any of a span of ``length`` inputs, and all that they read."""
-    assert isinstance(layer, nn.Conv2d | nn.MaxPool2d)
-    kernel = _number(layer.kernel_size)
-    stride = _number(layer.stride)
-    padding = _number(layer.padding)
+    kernel, stride, padding = _window(layer)
 
     # Output i reads from i · stride - padding on. A pooling may leave out the last inputs; then the
     # last output is computed again.
