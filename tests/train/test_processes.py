@@ -7,12 +7,22 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from lightning import Callback
 
 from gsgan.train.callbacks import WholeSchedule
 from gsgan.utils.errors import ConfigError
 
-TWO = {"devices": 2, "strategy": "ddp_fork_find_unused_parameters_true"}
+
+@pytest.fixture
+def two(tiny):
+    """Two processes of trainer=ddp_cpu, which are forks of the test's."""
+    strategy = instantiate(
+        tiny("trainer=ddp_cpu").trainer.strategy, start_method="fork"
+    )
+    return {"devices": 2, "strategy": strategy}
+
+
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 
 
@@ -31,11 +41,11 @@ class Losses(Callback):
 
 
 def test_two_processes_have_the_losses_of_one_with_the_whole_batch(
-    make, tmp_path
+    make, two, tmp_path
 ):
     """In float32 sums are rounded differently: 2e-6 of the loss is what was measured."""
     found = []
-    for batch, more in ((2, {}), (1, TWO)):
+    for batch, more in ((2, {}), (1, two)):
         path = tmp_path / f"{batch}.json"
         given = {
             "use_distributed_sampler": False,
@@ -59,12 +69,12 @@ class SpoilOne(Callback):
             batch.skeleton.fill_(float("nan"))
 
 
-def test_processes_skip_together_and_stop_together(make):
+def test_processes_skip_together_and_stop_together(make, two):
     module, trainer, data = make(
         "training.max_skipped=3",
         callbacks=[SpoilOne()],
         use_distributed_sampler=False,
-        **TWO,
+        **two,
     )
     with pytest.raises(Exception, match=r"iteration 7.* 3 of"):
         trainer.fit(module, data)
