@@ -125,14 +125,15 @@ class LearntWeights(nn.Module):
             .masked_fill(~possible, -30.0)
         )
 
-        # The entries of the field that each point's bones have at its controls, N · BONES rows.
-        entries = near.unsqueeze(1) * joints + index.unsqueeze(2)
-        shares = share.unsqueeze(1).expand_as(entries)
+        # The entries of the field that each point's bones have at its controls, BONES · N rows:
+        # a softmax over few columns would be many times slower than one over few rows.
+        entries = near * joints + index.mT.unsqueeze(2)
+        shares = share.expand_as(entries)
 
         # The tables follow from the body, so that checkpoints do not hold them.
         for name, value in {
             "index": index,
-            "start": start,
+            "start": start.mT.contiguous(),
             "near": near,
             "share": share,
             "entries": entries.flatten(0, 1),
@@ -160,7 +161,8 @@ class LearntWeights(nn.Module):
             moved = self._interpolate_field(
                 field, self.entries, self.entry_shares
             )
-            return (self.start + moved.view_as(self.start)).softmax(1)
+            logits = self.start + moved.view_as(self.start)
+            return logits.softmax(0).mT.contiguous()
 
         return derive(self, "weights", make, self.field)
 

@@ -177,6 +177,9 @@ def run_training(options: TrainOptions) -> None:
         _refuse_page(module.avatar)
     seed_everything(options.seed, workers=True, verbose=False)
 
+    # Deterministic algorithms would fill all new memory with NaN first: 5 % of the time.
+    torch.utils.deterministic.fill_uninitialized_memory = False
+
     # An earlier part of the run in the same folder is continued.
     resume = None
     done = 0
