@@ -19,7 +19,7 @@ from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
-from gsgan.utils.checks import at_least, between, one_of
+from gsgan.utils.checks import at_least, between, one_of, whole
 from gsgan.utils.tensors import full_precision
 
 
@@ -32,6 +32,7 @@ class StepOneLoss:
         feature_head, alpha, perceptual: weights, see conf/training/long.yaml; 0 builds no readout
             of F, and no perceptual network for Step I.
         perceptual_from: share of Step I without the perceptual loss.
+        perceptual_every: iterations from one perceptual loss to the next.
 
     Source: paper Sec. 3.5 (λ = 0.2), without readout, alpha and the perceptual loss.
     """
@@ -42,9 +43,11 @@ class StepOneLoss:
     alpha: float
     perceptual: float
     perceptual_from: float
+    perceptual_every: int
 
     def __post_init__(self) -> None:
         at_least("training.step_one.perceptual", self.perceptual, 0)
+        whole("training.step_one.perceptual_every", self.perceptual_every, 1)
         between("training.step_one.perceptual_from", self.perceptual_from, 0, 1)
 
     def __call__(
@@ -234,7 +237,7 @@ class StepTwoLoss:
 
     def __post_init__(self) -> None:
         one_of("training.step_two.gan", self.gan, FORMS)
-        at_least("training.step_two.perceptual_every", self.perceptual_every, 1)
+        whole("training.step_two.perceptual_every", self.perceptual_every, 1)
 
     def discriminator_maps(
         self, discriminator: Discriminator, rendering: Rendering, frame: Frame
