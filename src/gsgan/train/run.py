@@ -178,7 +178,7 @@ def run_training(options: TrainOptions) -> None:
     seed_everything(options.seed, workers=True, verbose=False)
 
     # Deterministic algorithms would fill all new memory with NaN first: 5 % of the time.
-    torch.utils.deterministic.fill_uninitialized_memory = False
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
     # An earlier part of the run in the same folder is continued.
     resume = None
