@@ -8,11 +8,14 @@ arguments it gets must be what our own backends draw.
 import importlib.util
 import logging
 import sys
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from packaging.requirements import Requirement
 from splat_scenes import (
     camera,
     cloud,
@@ -37,6 +40,7 @@ from gsgan.splat import (
     resolve_backend,
 )
 
+ROOT = Path(__file__).parents[2]
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 STANDARD = ACCURACY["standard"]
 
@@ -320,6 +324,15 @@ class Older(StandIn):
         assert means.shape == (N, 3), means.shape
 
 
+class Few(StandIn):
+    """A build that draws no more than colours."""
+
+    def rasterization(self, means, *args, colors, **given):
+        if colors.shape[-1] > 3:
+            raise RuntimeError("Unsupported number of channels")
+        return super().rasterization(means, *args, colors=colors, **given)
+
+
 class Newer(StandIn):
     """gsplat 1.6's interface: further arguments with defaults, and another cap."""
 
@@ -369,7 +382,13 @@ class Newer(StandIn):
             broken(RuntimeError(BUILD)),
             "cpu",
             "float32",
-            [BROKEN, 'no member "Sum"', "CUDA 12.8"],
+            [BROKEN, 'no member "Sum"', "-c constraints-cuda.txt"],
+        ),
+        (
+            Few(),
+            "cpu",
+            "float32",
+            [BROKEN, "RuntimeError: Unsupported number of channels"],
         ),
     ],
 )
@@ -447,19 +466,26 @@ def test_the_package_draws_the_same_as_torch(shape, antialias):
     assert_same(got, drawn(gaussians, cam, "torch", settings), tolerance=1e-3)
 
 
-def test_the_extra_admits_no_version_without_batches():
-    import tomllib
-    from pathlib import Path
+def test_the_constraints_of_cuda_are_admitted():
+    """pip resolves them; the package index is not asked here."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]["gsplat"]
+    requirements = {
+        requirement.name: requirement.specifier
+        for requirement in map(Requirement, project["dependencies"] + extras)
+    }
+    lines = (ROOT / "constraints-cuda.txt").read_text().splitlines()
+    pinned = [line for line in lines if not line.startswith("#")]
+    assert len(pinned) == 3
+    for line in pinned:
+        name, version = line.split("==")
+        assert version in requirements[name], line
 
-    project = tomllib.loads(
-        (Path(__file__).parents[2] / "pyproject.toml").read_text()
-    )
+
+def test_the_extra_admits_no_version_without_batches():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     (requirement,) = project["project"]["optional-dependencies"]["gsplat"]
-    specifier = (
-        importlib.import_module("packaging.requirements")
-        .Requirement(requirement)
-        .specifier
-    )
+    specifier = Requirement(requirement).specifier
     assert [
         version for version in ("1.5.0", "1.5.2") if version in specifier
     ] == []

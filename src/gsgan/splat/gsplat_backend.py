@@ -38,6 +38,8 @@ COMPILED_IN: dict[str, Any] = {
     "dtype": "float32",
     "fov_clamp": 1.3,
 }
+# What gsplat draws at once at most, with the kernel that needs most of the GPU's shared memory.
+PROBE_CHANNELS = 32
 CUTOFF_TOLERANCE = 1e-5  # relative, between a setting and the compiled-in value
 
 
@@ -205,7 +207,7 @@ def _measure_cap(device: torch.device) -> tuple[float | None, str]:
         quats=torch.tensor([[[1.0, 0.0, 0.0, 0.0]]], device=device),
         scales=torch.ones(1, 1, 3, device=device),
         opacities=torch.ones(1, 1, device=device),
-        features=torch.ones(1, 1, 1, device=device),
+        features=torch.ones(1, 1, PROBE_CHANNELS, device=device),
     )
     K = [[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]
     camera = Camera(
@@ -223,8 +225,8 @@ def _measure_cap(device: torch.device) -> tuple[float | None, str]:
     except Exception as error:
         return None, (
             f"gsplat {_version()} is installed but cannot draw here ({first_error(error)}); gsplat "
-            "1.5.3 or newer is needed, and 1.5.3 does not compile against CUDA 13: take torch 2.8 "
-            "for CUDA 12.8."
+            "1.5.3 or newer is needed, and 1.5.3 does not compile against CUDA 13: install with "
+            "-c constraints-cuda.txt."
         )
 
 
