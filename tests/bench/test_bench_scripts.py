@@ -233,3 +233,24 @@ def test_a_film_has_no_error_against_itself(monkeypatch, tmp_path):
     masks = door["mask_errors"](truth, truth)
     assert masks["IoU"] == 1
     assert masks["outline 90 %"] == 0
+
+
+@pytest.mark.slow
+def test_generator_compares_models_by_their_gaussians(script, tmp_path):
+    given = ["experiment=smoke", "score_images=1", "lpips.path=null", *SCENE]
+    assert not script(
+        "generator",
+        "points=[alg1]",
+        "further={alg1: [wo_seg]}",
+        f"train=[{','.join(given)}]",
+    )
+    rows = read(tmp_path, "generator")["rows"]
+    trained = [(row["model"], row["image"]) for row in rows]
+    assert trained == [
+        ("full", "final"),
+        ("full", "Step I's colour"),
+        ("splat_only", "final"),
+        ("wo_seg", "final"),
+        ("wo_seg", "Step I's colour"),
+    ]
+    assert (tmp_path / "out" / "generator.png").is_file()
