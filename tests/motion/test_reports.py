@@ -169,6 +169,8 @@ def test_no_frame_is_lost_by_rounding(frames, fps):
 NAMES = {
     "mocopi": "l_up_leg l_low_leg l_foot l_toes l_up_arm l_low_arm l_hand",
     "Motive": "LThigh LShin LFoot LToe LUArm LFArm LHand",
+    "SMPL": "L_Hip L_Knee L_Ankle L_Foot L_Shoulder L_Elbow L_Wrist",
+    "SMPL-X": "left_hip left_knee left_ankle left_foot left_shoulder left_elbow left_wrist",
     "DAZ": "lThighBend lShin lFoot lToe lShldrBend lForearmBend lHand",
     "Mixamo": "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
     "mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand",

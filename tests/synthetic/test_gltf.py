@@ -6,6 +6,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pygltflib
 import pytest
@@ -19,6 +20,7 @@ from gsgan.motion.humanoid import mixamo_bone, vrm_bone
 from gsgan.motion.standard import find_joints
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
+from gsgan.synthetic.parts import texture_lab
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
@@ -185,20 +187,28 @@ def test_a_texture_transform_is_applied_to_the_coordinates(tmp_path):
     np.testing.assert_allclose(character.uv[0], [0.1 + 0.75, 0.2 - 0.5])
 
 
-def test_colours_of_vertices_are_a_texture(tmp_path, tiny):
+def test_colours_of_vertices_multiply_the_texture(tmp_path, tiny):
     glb = TinyGlb()
-    glb.doc.materials[0].pbrMetallicRoughness.baseColorTexture = None
     colours = coloured(glb)
     character = read_character(glb.write(tmp_path / "a.glb"))
-    np.testing.assert_allclose(
-        character.vertices[character.faces], tiny.vertices[tiny.faces]
+    np.testing.assert_array_equal(
+        character.surfaces[0].colour, tiny.surfaces[0].colour
     )
-    image = character.surfaces[0].colour
-    column, row = np.floor(character.uv * len(image)).astype(int).T
-    expected = srgb(colours.astype(float))[tiny.faces.ravel()]
-    np.testing.assert_allclose(
-        image[row, column, :3] / 255, expected, atol=0.003
-    )
+    np.testing.assert_allclose(character.tint[:, :3], colours, atol=1e-6)
+    assert (character.tint[:, 3] == 1).all()
+    assert tiny.tint is None
+
+    # In linear light, at the corners of faces.
+    uv = tiny.uv[tiny.faces[:, 0]]
+    plain = tiny.surfaces[0].colour
+    size = np.array(plain.shape[1::-1])
+    column, row = (uv % 1 * size).astype(int).T
+    light = linear(plain[row, column, :3] / 255.0)
+    at = character.tint[character.faces[:, 0]]
+    expected = srgb(light * colours[tiny.faces[:, 0]])
+    lab = texture_lab(character, uv, character.material, at)
+    rgb = cv2.cvtColor(lab[:, None].astype("f4"), cv2.COLOR_LAB2RGB)[:, 0]
+    np.testing.assert_allclose(rgb, expected, atol=3e-3)
 
 
 def test_a_texture_without_an_image_is_white(tmp_path):
@@ -582,6 +592,11 @@ def coloured(glb: TinyGlb) -> np.ndarray:
     return colours
 
 
+def emits_with_colours(glb: TinyGlb) -> None:
+    coloured(glb)
+    glb.doc.materials[0].emissiveFactor = [1, 1, 1]
+
+
 LEFT_HAND = list(BONES).index("LeftHand")
 BAD = {
     "no skin": no_skin,
@@ -600,7 +615,7 @@ BAD = {
     "EXT_texture_avif is not supported": lambda glb: setattr(
         glb.doc, "textures", [AVIF]
     ),
-    "bake the colours into the texture": lambda glb: coloured(glb),
+    "emits light and its mesh has colours": emits_with_colours,
     "a face names a vertex": a_face_too_many,
     "not numbers": a_nan,
     "circle": lambda glb: setattr(glb.doc.nodes[3], "children", [0]),

@@ -61,6 +61,9 @@ from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
+MIN_IMAGES = (
+    0.2  # share of the frames of the camera with most that each must have
+)
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 
 
@@ -115,7 +118,10 @@ def prepare(options: Options, console: Console | None = None) -> Path:
     )
     write_files(root, outcome, key)
     numbers = summarise(outcome) | solved.numbers
-    numbers["clock_errors"] = _clock_errors(outcome, solved.drift)
+    numbers["errors"] = [
+        *_clock_errors(outcome, solved.drift),
+        *_short_cameras(outcome),
+    ]
     write_json(root / "prepare.json", numbers)
     publish(root, out)
 
@@ -337,11 +343,25 @@ def _clock_errors(outcome: Outcome, drift: Float) -> list[str]:
     return errors or (late.notes if late.wrong else [])
 
 
+def _short_cameras(outcome: Outcome) -> list[str]:
+    """A sentence for each camera with an image in few of the frames that others have."""
+    counts = {name: len(frames) for name, frames in outcome.written.items()}
+    most = max(counts.values())
+    errors = []
+    for name, count in counts.items():
+        if count < MIN_IMAGES * most:
+            errors.append(
+                f"{name} has images with a mask in {count} of {most} frames: copy its images and "
+                "masks again, or leave it out of the source"
+            )
+    return errors
+
+
 def _refuse_errors(out: Path) -> None:
-    """Raises a DataError if the clocks of the dataset are wrong, or its check has found errors."""
-    clocks = read_json(out / "prepare.json").get("clock_errors")
-    if clocks:
-        raise DataError(f"{out} was written, but {'; '.join(clocks)}")
+    """Raises a DataError if a camera of the dataset is of no use, or its check has found errors."""
+    wrong = read_json(out / "prepare.json").get("errors")
+    if wrong:
+        raise DataError(f"{out} was written, but {'; '.join(wrong)}")
     findings = read_json(out / "check.json")["findings"]
     errors = []
     for finding in findings:

@@ -50,6 +50,8 @@ GONE = {
 # An element of a list on the command line: in quotes, or up to the next comma.
 ELEMENT = re.compile(r"""\s*('[^']*'|"[^"]*"|[^,]+?)\s*(?:,|$)""")
 SWEEPS = ("-m", "--multirun")
+# What OmegaConf would read as the value of another key, ${HOME}, and not as a call, ${now:%H}.
+REFERENCE = re.compile(r"(\\*)\$\{(?![\w.]+:.*\})")
 
 # Keys of a dataset that are paths, and where a config holds a dataset.
 DATA_PATHS = ("root", "smpl", "source.avatar", "source.motion")
@@ -214,7 +216,9 @@ def paths_as_text(config: DictConfig) -> None:
         if isinstance(value, (bool, int, float)):
             OmegaConf.update(config, key, str(value))
         elif isinstance(value, ListConfig):
-            OmegaConf.update(config, key, [str(path) for path in value])
+            # Not resolved: text with ${ keeps its backslash.
+            listed = OmegaConf.to_container(value, resolve=False) or ()
+            OmegaConf.update(config, key, [str(path) for path in listed])
 
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -418,6 +422,10 @@ def quote(argument: str, sweep: bool = False) -> str:
         return argument
     name = key.lstrip("+")
 
+    # A backslash makes text of a reference to another key; folders of runs may have references.
+    if name in PATHS and not name.startswith("hydra."):
+        value = REFERENCE.sub(r"\1\1\\${", value)
+
     # A list of paths, each of them as typed.
     listed = value.startswith("[") and value.endswith("]")
     if name in PATH_LISTS and listed:
@@ -433,9 +441,11 @@ def quote(argument: str, sweep: bool = False) -> str:
     ):
         return f"{key}={value}"
 
-    # No value at all, or text.
+    # No value at all, or text; OmegaConf's mark of a missing value is none.
     if value == "null":
         return argument
+    if value == "???":
+        value = "./???"
     return f"{key}={_as_text(value)}"
 
 
