@@ -5,12 +5,15 @@ from itertools import pairwise
 
 import pytest
 from omegaconf import OmegaConf
+from omegaconf.errors import InterpolationKeyError
 
 from gsgan.utils.config import (
     DATA_PATHS,
     PATH_LISTS,
     PATHS,
+    build,
     config_folder,
+    one_sentence,
     paths_as_text,
     quote,
 )
@@ -69,7 +72,7 @@ def parsed(argument: str) -> object:
 def test_odd_paths_arrive_as_typed(key, path):
     if key == "other_capture" and path.startswith("{"):
         return  # keys of a dataset
-    if key.startswith("hydra.") and "${" in path:
+    if "." in key and "${" in path:
         return  # values of other keys
     assert str(parsed(f"{key}={path}")) == path
     assert type(parsed(f"{key}={path}")) is not int
@@ -106,7 +109,17 @@ def test_numbers_of_config_files_become_text():
 def test_references_in_lists_are_text():
     config = OmegaConf.create({"motion": ["\\${a}.bvh", 3]})
     paths_as_text(config)
-    assert list(config.motion) == ["${a}.bvh", "3"]
+    assert build(config.motion) == ["${a}.bvh", "3"]
+
+
+def test_a_reference_that_leads_nowhere_is_named():
+    config = OmegaConf.create({"data": {"root": "takes/${x}"}})
+    with pytest.raises(InterpolationKeyError) as error:
+        _ = config.data.root
+    sentence = one_sentence(error.value)
+    assert "data.root" in sentence
+    assert "another key" in sentence
+    assert "\n" not in sentence
 
 
 def test_the_mark_of_a_missing_value_is_a_path():

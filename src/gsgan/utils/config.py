@@ -25,7 +25,10 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_class, get_method, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import (
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
 from rich.console import Console
 
 from gsgan.utils.errors import ConfigError, GsganError
@@ -186,6 +189,9 @@ def build(value: Any, **further: Any) -> Any:
     """
     if not OmegaConf.is_config(value):
         return value
+    # Hydra would resolve text with ${ twice.
+    if OmegaConf.is_list(value) and all(isinstance(one, str) for one in value):
+        return list(value)
     try:
         return instantiate(value, _convert_="all", **further)
     except InstantiationException as error:
@@ -422,8 +428,8 @@ def quote(argument: str, sweep: bool = False) -> str:
         return argument
     name = key.lstrip("+")
 
-    # A backslash makes text of a reference to another key; folders of runs may have references.
-    if name in PATHS and not name.startswith("hydra."):
+    # A backslash makes text of a reference to another key; keys of a group may have references.
+    if name in PATHS and "." not in name:
         value = REFERENCE.sub(r"\1\1\\${", value)
 
     # A list of paths, each of them as typed.
@@ -513,6 +519,12 @@ def one_sentence(error: BaseException) -> str | None:
         return (
             f"{error.filename or 'a file'} cannot be written ({error.strerror}): make room, then "
             "start the same command again"
+        )
+    if isinstance(error, InterpolationResolutionError):
+        where = f"{error.full_key}: " if error.full_key else ""
+        return (
+            f"{where}{str(error).splitlines()[0]}; ${{…}} takes the value of another key, so a "
+            "path that holds it needs another name"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
