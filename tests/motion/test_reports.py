@@ -130,6 +130,13 @@ def test_spaces_line_ends_and_marks_do_not_matter(
     np.testing.assert_array_equal(motion.root, plain.root)
 
 
+def test_a_motion_without_any_joint_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, p=np.full((3, 33, 3), np.nan))
+    with pytest.raises(DataError, match="no joint of any frame has a position"):
+        read_motion(path, Source(None))
+
+
 def test_a_rate_in_place_of_the_time_is_a_rate(tmp_path):
     text = BVH.replace("{chest}", "0 0 0").replace("0.0333333", "30")
     assert read_bvh(written(tmp_path, text)).frame_time == pytest.approx(1 / 30)

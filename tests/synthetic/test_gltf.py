@@ -4,6 +4,7 @@ import base64
 import re
 import sys
 import zlib
+from copy import copy
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import pygltflib
 import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
-from tiny_glb import BONES, TinyGlb
+from tiny_glb import BONES, SIDES, TinyGlb
 
 from gsgan.body.free import free_body
 from gsgan.motion.gltf_file import DRACO, GltfFile
@@ -209,6 +210,33 @@ def test_colours_of_vertices_multiply_the_texture(tmp_path, tiny):
     lab = texture_lab(character, uv, character.material, at)
     rgb = cv2.cvtColor(lab[:, None].astype("f4"), cv2.COLOR_LAB2RGB)[:, 0]
     np.testing.assert_allclose(rgb, expected, atol=3e-3)
+
+
+@pytest.mark.parametrize("mode", [5, 6], ids=["strip", "fan"])
+def test_strips_and_fans_are_the_same_triangles(tmp_path, mode, tiny):
+    """A box's side is two triangles, in one strip or fan of four corners."""
+    glb = TinyGlb()
+    mesh = glb.doc.meshes[0]
+    whole = mesh.primitives[0]
+    quads = []
+    for first in range(0, len(tiny.vertices), 8):
+        quads += (first + SIDES).tolist()
+    mesh.primitives = []
+    for a, b, c, d in quads:
+        corners = [a, b, d, c] if mode == 5 else [a, b, c, d]
+        side = copy(whole)
+        side.mode = mode
+        side.indices = glb.accessor(np.array(corners, "u2")[:, None], "SCALAR")
+        mesh.primitives.append(side)
+    read = read_character(glb.write(tmp_path / "a.glb"))
+    areas = []
+    for character in (tiny, read):
+        corners = character.vertices[character.faces]
+        edges = corners[:, 1:] - corners[:, :1]
+        middle = corners.mean(axis=1)
+        normals = np.cross(edges[:, 0], edges[:, 1])
+        areas.append([(normals * middle).sum(), np.abs(normals).sum()])
+    np.testing.assert_allclose(areas[0], areas[1], rtol=1e-6)
 
 
 def test_a_texture_without_an_image_is_white(tmp_path):
@@ -583,13 +611,19 @@ def a_nan(glb: TinyGlb) -> None:
 AVIF = pygltflib.Texture(extensions={"EXT_texture_avif": {"source": 0}})
 
 
-def coloured(glb: TinyGlb) -> np.ndarray:
+def coloured(glb: TinyGlb, factor: float = 1.0) -> np.ndarray:
     """Gives the vertices colours, which it returns."""
     attributes = glb.doc.meshes[0].primitives[0].attributes
     count = glb.doc.accessors[attributes.POSITION].count
     colours = np.random.default_rng(0).random((count, 3)).astype("f4")
+    colours *= np.float32(factor)
     attributes.COLOR_0 = glb.accessor(colours, "VEC3")
     return colours
+
+
+def short_colours(glb: TinyGlb) -> None:
+    attributes = glb.doc.meshes[0].primitives[0].attributes
+    attributes.COLOR_0 = glb.accessor(np.ones((3, 3), "f4"), "VEC3")
 
 
 def emits_with_colours(glb: TinyGlb) -> None:
@@ -617,6 +651,11 @@ BAD = {
     ),
     "emits light and its mesh has colours": emits_with_colours,
     "a face names a vertex": a_face_too_many,
+    "differ in their lengths": lambda glb: short_colours(glb),
+    "colours of vertices are not numbers": lambda glb: coloured(glb, np.nan),
+    "refers to an entry that is not there": lambda glb: setattr(
+        glb.doc.meshes[0].primitives[0], "material", 7
+    ),
     "not numbers": a_nan,
     "circle": lambda glb: setattr(glb.doc.nodes[3], "children", [0]),
     "damaged": lambda glb: setattr(glb.doc.accessors[0], "count", 10**6),

@@ -44,7 +44,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import find_crowds, one_person
+from gsgan.prepare.people import find_crowds, find_jumps, one_person
 from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -195,6 +195,7 @@ def _from_several(
         inputs = _in_metres(options, inputs, uv, conf)
 
     # The joints, and the clocks of the cameras.
+    inputs = _with_first_look(inputs, frames, uv, conf)
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
     solution = _solve_frames(options, inputs, frames, uv, conf, alphas, console)
@@ -598,12 +599,7 @@ def _solve_frames(
     console: Console,
 ) -> Solution:
     """The joints and cameras that fit undistorted pixels, see `_undistort`."""
-    # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
-    C = len(cameras)
-    flat_uv = uv.reshape(C, -1, 2)
-    p = plain(cameras, flat_uv, conf.reshape(C, -1))
-    _check_distance(inputs, p)
     offsets = options.offsets or {}
     numbers = {name: frames - offsets.get(name, 0) for name in inputs.sources}
     outlines = find_outlines(inputs.cameras, alphas, numbers)
@@ -616,6 +612,29 @@ def _solve_frames(
             outlines=outlines,
             settings=options.solve,
         )
+
+
+def _with_first_look(
+    inputs: Inputs, frames: Ints, uv: Float, conf: Float
+) -> Inputs:
+    """The inputs with a note on a person who jumps, by a quick solution, see `_undistort`.
+
+    Raises:
+        DataError: on cameras in a wrong unit, before the long solution begins.
+    """
+    cameras = CameraArray.of(inputs.cameras)
+    C, F, J = uv.shape[:3]
+    p = plain(cameras, uv.reshape(C, -1, 2), conf.reshape(C, -1))
+    _check_distance(inputs, p)
+    jumps = find_jumps(p.reshape(F, J, 3)[:, :BODY], frames / inputs.fps)
+    if not jumps:
+        return inputs
+    before, after = frames[jumps[0] - 1], frames[jumps[0]]
+    note = (
+        f"doubtful: the person is elsewhere from frame {before} to {after}, as in {len(jumps)} "
+        "frames: another person may follow; prepare each part alone with frames="
+    )
+    return replace(inputs, notes=[*inputs.notes, note])
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:

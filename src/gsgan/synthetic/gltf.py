@@ -71,7 +71,7 @@ STRENGTH = "KHR_materials_emissive_strength"
 UNLIT = "KHR_materials_unlit"
 CHARACTER_FILES = (".glb", ".gltf", ".vrm")
 UPRIGHT = 0.7  # cosine between the way from hips to head and the vertical
-TRIANGLES = 4  # glTF's number of this primitive mode
+TRIANGLES, STRIP, FAN = 4, 5, 6  # glTF's numbers of these primitive modes
 AVATAR_FILES = sorted(Path(__file__).with_name("avatars").glob("*.glb"))
 AVATARS = {path.stem: path for path in AVATAR_FILES}
 """Files of the avatars that come with gsgan, by name."""
@@ -102,6 +102,8 @@ def read_character(path: Path) -> Character:
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
+        if isinstance(error, IndexError):
+            reason = "it refers to an entry that is not there"
         raise DataError(
             f"{path}: damaged ({reason}); export the character again"
         ) from error
@@ -250,7 +252,7 @@ def _parts(glb: GltfFile, skeleton: _Skeleton) -> list[_Part]:
         if node.mesh is None or not on_bone:
             continue
         for primitive in glb.doc.meshes[node.mesh].primitives:
-            if primitive.mode in (None, TRIANGLES):
+            if primitive.mode in (None, TRIANGLES, STRIP, FAN):
                 parts.append(_part(glb, skeleton, i, primitive))
     return parts
 
@@ -265,6 +267,9 @@ def _part(
     }
 
     glb.decompress(primitive)
+    counts = {glb.doc.accessors[k].count for k in attributes.values()}
+    if len(counts) > 1:
+        raise ValueError("attributes of one mesh differ in their lengths")
 
     # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
@@ -297,12 +302,25 @@ def _part(
         vertices=_transform(linear, position) + binding.to_world[:, :3, 3],
         normals=normals,
         uv=uv,
-        faces=corners[: len(corners) // 3 * 3].reshape(-1, 3),
+        faces=_faces(corners, primitive.mode),
         bone_index=binding.bones,
         bone_weight=binding.weights,
         shapes=_shapes(glb, names, primitive.targets or (), linear),
         tint=_tint(glb, primitive, attributes, len(position)),
     )
+
+
+def _faces(corners: Ints, mode: int | None) -> Ints:
+    """``[F, 3]`` vertices of the triangles, strip or fan of ``corners``."""
+    if mode == STRIP:
+        # Every other triangle of a strip runs the other way round.
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+        return faces
+    if mode == FAN:
+        first = np.full(len(corners) - 2, corners[0])
+        return np.stack([first, corners[1:-1], corners[2:]], axis=1)
+    return corners[: len(corners) // 3 * 3].reshape(-1, 3)
 
 
 def _transform_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
@@ -326,6 +344,8 @@ def _tint(
     if "COLOR_0" in attributes:
         given = glb.accessor(attributes["COLOR_0"])
         tint[:, : given.shape[1]] = given
+        if not np.isfinite(tint).all():
+            raise ValueError("colours of vertices are not numbers")
     if primitive.material is None:
         tint[:, 3] = 1
         return tint
