@@ -222,7 +222,7 @@ CAPTURE: list[Case] = [
     (r"000000\.jpg.*CMYK", cmyk),
     (
         r"000001\.png.*palette",
-        write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
+        write("labels/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
     ),
     (r"000001\.png.*0001\.png", write("images/cam00/0001.png", b"")),
 ]

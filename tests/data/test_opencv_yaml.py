@@ -25,7 +25,8 @@ def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "head", ["%YAML:1.0\r\n---\r\n", "%YAML 1.2\n---\n", "\ufeff%YAML:1.0\n"]
+    "head",
+    ["%YAML:1.0\r\n---\r\n", "%YAML 1.2\n---\n", "---\n", "\ufeff%YAML:1.0\n"],
 )
 def test_heads(tmp_path, head):
     (tmp_path / "a.yml").write_bytes(

@@ -281,7 +281,30 @@ def test_times_beside_the_number_of_the_frame_do_not_count():
     assert list(map(counting(stems), stems)) == [0, 1, 2]
 
 
-@pytest.mark.parametrize("name", ["{:06d}_0", "frame{:04d}_cam1", "{}"])
+NAMES = (
+    "{:06d}_0",
+    "frame{:04d}_cam1",
+    "cam1_frame{:04d}",
+    "Frame {:d} camera 12",
+    "take3_f{:03d}",
+    "{:d}",
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_number_that_differs_counts_frames(name):
     stems = [name.format(frame) for frame in (0, 1, 10)]
     assert list(map(counting(stems), stems)) == [0, 1, 10]
+
+
+@pytest.mark.parametrize("name", NAMES[1:])
+def test_one_image_is_numbered_by_the_word_before_its_number(name):
+    stem = name.format(7)
+    assert counting([stem])(stem) == 7
+
+
+def test_words_decide_which_of_two_numbers_counts_frames():
+    stems = [f"frame{k:04d}_person{k % 2}" for k in range(4)]
+    assert list(map(counting(stems), stems)) == [0, 1, 2, 3]
+    stems = [f"{k}_view{k % 2}" for k in range(4)]
+    assert list(map(counting(stems), stems)) == [0, 1, 2, 3]

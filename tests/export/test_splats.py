@@ -10,6 +10,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from gsgan.export.glb import to_y_up
 from gsgan.export.splats import (
     Splats,
     glb_bytes,
@@ -268,3 +269,63 @@ def test_spz_files_hold_quantised_columns_with_y_up():
     before = splats.sh[:, 1:]  # of y, z, x with signs - + -
     expected = np.stack([-before[:, 1], -before[:, 0], before[:, 2]], axis=1)
     assert np.abs(np.abs(rest) - np.abs(expected)).max() < 0.05
+
+
+def test_gsply_reads_spz_files(tmp_path):
+    """A reader that no one here wrote; the world already has Y up, so nothing is turned."""
+    gsply = pytest.importorskip("gsply.spz")
+    splats = some_splats(50)
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(splats, "y"))
+    read = gsply.read_spz(path)
+    front = splats.means @ to_y_up("y").T
+    np.testing.assert_allclose(read.means, front, atol=2e-4)
+    np.testing.assert_allclose(np.exp(read.scales), splats.scales, rtol=0.04)
+    opacities = 1 / (1 + np.exp(-read.opacities))
+    np.testing.assert_allclose(opacities, splats.opacities, atol=0.003)
+    np.testing.assert_allclose(read.sh0, splats.sh[:, 0], atol=0.02)
+    turned = Rotation.from_matrix(to_y_up("y")) * Rotation.from_quat(
+        splats.quats, scalar_first=True
+    )
+    off = turned.inv() * Rotation.from_quat(read.quats, scalar_first=True)
+    assert np.degrees(off.magnitude()).max() < 6
+
+
+def test_ply2splat_reads_splat_files(tmp_path):
+    """A reader that no one here wrote."""
+    ply2splat = pytest.importorskip("ply2splat")
+    splats = some_splats(50)
+    path = tmp_path / "a.splat"
+    path.write_bytes(splat_bytes(splats))
+    read = list(ply2splat.load_splat_file(str(path)))
+    size = splats.opacities * splats.scales.prod(axis=1)
+    order = np.argsort(-size, kind="stable")
+    means = np.array([splat.position for splat in read])
+    np.testing.assert_allclose(means, splats.means[order], rtol=1e-6)
+    scales = np.array([splat.scale for splat in read])
+    np.testing.assert_allclose(scales, splats.scales[order], rtol=1e-6)
+    colour = np.array([splat.color for splat in read]) / 255
+    shown = 0.5 + 0.28209479 * splats.sh[order, 0]
+    np.testing.assert_allclose(colour[:, :3], shown, atol=0.003)
+    np.testing.assert_allclose(
+        colour[:, 3], splats.opacities[order], atol=0.003
+    )
+    quats = np.array([splat.rotation for splat in read]) / 128 - 1
+    away = Rotation.from_quat(quats, scalar_first=True).inv() * (
+        Rotation.from_quat(splats.quats[order], scalar_first=True)
+    )
+    assert np.degrees(away.magnitude()).max() < 2
+
+
+def test_ply2splat_makes_the_same_file_of_a_ply(tmp_path):
+    ply2splat = pytest.importorskip("ply2splat")
+    splats = some_splats(50)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(splats))
+    ply2splat.convert(str(tmp_path / "a.ply"), str(tmp_path / "theirs.splat"))
+    theirs = np.fromfile(tmp_path / "theirs.splat", np.uint8).reshape(-1, 32)
+    ours = np.frombuffer(splat_bytes(splats), np.uint8).reshape(-1, 32)
+    rows = [theirs[:, :24].view("<f4"), ours[:, :24].view("<f4")]
+    order = [np.lexsort(row[:, :3].T) for row in rows]
+    np.testing.assert_allclose(rows[0][order[0]], rows[1][order[1]], rtol=1e-5)
+    bytes_apart = theirs[order[0], 24:].astype(int) - ours[order[1], 24:]
+    assert np.abs(bytes_apart).max() <= 1

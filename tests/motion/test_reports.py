@@ -130,6 +130,13 @@ def test_spaces_line_ends_and_marks_do_not_matter(
     np.testing.assert_array_equal(motion.root, plain.root)
 
 
+def test_a_motion_without_any_joint_is_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, p=np.full((3, 33, 3), np.nan))
+    with pytest.raises(DataError, match="no joint of any frame has a position"):
+        read_motion(path, Source(None))
+
+
 def test_a_rate_in_place_of_the_time_is_a_rate(tmp_path):
     text = BVH.replace("{chest}", "0 0 0").replace("0.0333333", "30")
     assert read_bvh(written(tmp_path, text)).frame_time == pytest.approx(1 / 30)
@@ -169,6 +176,8 @@ def test_no_frame_is_lost_by_rounding(frames, fps):
 NAMES = {
     "mocopi": "l_up_leg l_low_leg l_foot l_toes l_up_arm l_low_arm l_hand",
     "Motive": "LThigh LShin LFoot LToe LUArm LFArm LHand",
+    "SMPL": "L_Hip L_Knee L_Ankle L_Foot L_Shoulder L_Elbow L_Wrist",
+    "SMPL-X": "left_hip left_knee left_ankle left_foot left_shoulder left_elbow left_wrist",
     "DAZ": "lThighBend lShin lFoot lToe lShldrBend lForearmBend lHand",
     "Mixamo": "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase "
     "mixamorig:LeftArm mixamorig:LeftForeArm mixamorig:LeftHand",

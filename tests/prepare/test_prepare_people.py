@@ -11,7 +11,7 @@ from make import skeletons
 
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.options import Inputs
-from gsgan.prepare.people import one_person
+from gsgan.prepare.people import find_jumps, one_person
 from gsgan.prepare.run import with_detections, with_one_person
 from gsgan.prepare.sources import Recording
 from gsgan.skeleton.joints import ALL, BODY
@@ -68,6 +68,38 @@ def test_the_same_person_is_taken_in_all_cameras():
             assert np.isnan(px[7]).all()
             px[7] = truth[7]
         np.testing.assert_allclose(px, truth)
+
+
+def test_joints_that_come_and_go_are_no_steps():
+    """Half of the joints are missing, others in each frame and camera."""
+    cameras = ring()
+    first = np.zeros((4, FRAMES), int)
+    given = detected(cameras, two_people(), first)
+    rng = np.random.default_rng(1)
+    for found in given.values():
+        for (_, conf), (_, other) in found.people:
+            conf[:BODY] = rng.random(BODY) < 0.6
+            other[:BODY] = rng.random(BODY) < 0.6
+    found, _ = one_person(given, cameras, {})
+    truth = seen(cameras, p=two_people()[0])[2]
+    other = seen(cameras, p=two_people()[1])[2]
+    px = np.stack([one.px[:, :BODY] for one in found.values()])
+    taken = [
+        np.nanmedian(np.abs(px - p), axis=(2, 3)) < 1 for p in (truth, other)
+    ]
+    seen_at_all = np.isfinite(px).any((2, 3))
+    assert seen_at_all.mean() > 0.9
+    assert any((one == seen_at_all).all() for one in taken)
+
+
+def test_a_person_who_takes_over_jumps():
+    p = np.concatenate([two_people()[0], two_people()[1] + [0.3, 0, 0]])
+    time = np.arange(len(p)) / 30
+    assert find_jumps(p, time) == [FRAMES]
+    assert find_jumps(p[:FRAMES], time[:FRAMES]) == []
+    p[3] += 2.0  # one frame is no other person
+    assert find_jumps(p, time) == [FRAMES]
+    assert find_jumps(p, 10 * time) == []
 
 
 def test_one_person_is_left_alone():

@@ -388,11 +388,20 @@ def scene_of(folder: Path, names: str, moments: int = 2) -> Path:
         "{camera}/{moment}.png",
         "images/frame_{moment}_{camera}.png",
         "images/{camera}_{moment}.jpg",
+        "images/frame{moment}_{camera}.png",
+        "images/{camera}_frame{moment}.png",
+        "{camera}frame{moment}.png",
+        "{camera}_{moment}_at_1{moment}.png",
     ],
 )
 def test_the_part_of_the_path_that_differs_names_the_camera(tmp_path, names):
     cameras = read_calibration(scene_of(tmp_path, names)).cameras
     assert sorted(cameras) == ["cam0", "cam1", "cam2"]
+
+
+def test_one_moment_is_named_by_the_word_of_the_camera(tmp_path):
+    path = scene_of(tmp_path, "frame{moment}_{camera}.png", moments=1)
+    assert sorted(read_calibration(path).cameras) == ["cam0", "cam1", "cam2"]
 
 
 def test_an_angle_of_view_alone_has_the_size_of_the_images(tmp_path):

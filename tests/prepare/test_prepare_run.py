@@ -93,6 +93,15 @@ def test_the_numbers_have_every_stage_and_the_dataset_is_checked(
     assert json.loads((out / "check.json").read_text())["errors"] == 0
 
 
+def test_a_camera_with_one_image_is_an_error(project):
+    for path in sorted((project / "masks" / "cam01").iterdir())[1:]:
+        path.unlink()
+    with pytest.raises(
+        DataError, match=r"cam01 has images with a mask in 1 of"
+    ):
+        prepare(options(project), quiet())
+
+
 def test_images_are_undistorted_and_scaled(project):
     out = prepare(options(project, scale=0.5, format="png"), quiet())
     camera = read_capture(out).cameras["cam00"]

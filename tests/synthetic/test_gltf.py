@@ -4,14 +4,16 @@ import base64
 import re
 import sys
 import zlib
+from copy import copy
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pygltflib
 import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
-from tiny_glb import BONES, TinyGlb
+from tiny_glb import BONES, SIDES, TinyGlb
 
 from gsgan.body.free import free_body
 from gsgan.motion.gltf_file import DRACO, GltfFile
@@ -19,6 +21,7 @@ from gsgan.motion.humanoid import mixamo_bone, vrm_bone
 from gsgan.motion.standard import find_joints
 from gsgan.synthetic.anchors import FACE_NAMES
 from gsgan.synthetic.gltf import AVATARS, read_character
+from gsgan.synthetic.parts import texture_lab
 from gsgan.synthetic.textures import linear, srgb
 from gsgan.utils.errors import DataError
 
@@ -185,20 +188,55 @@ def test_a_texture_transform_is_applied_to_the_coordinates(tmp_path):
     np.testing.assert_allclose(character.uv[0], [0.1 + 0.75, 0.2 - 0.5])
 
 
-def test_colours_of_vertices_are_a_texture(tmp_path, tiny):
+def test_colours_of_vertices_multiply_the_texture(tmp_path, tiny):
     glb = TinyGlb()
-    glb.doc.materials[0].pbrMetallicRoughness.baseColorTexture = None
     colours = coloured(glb)
     character = read_character(glb.write(tmp_path / "a.glb"))
-    np.testing.assert_allclose(
-        character.vertices[character.faces], tiny.vertices[tiny.faces]
+    np.testing.assert_array_equal(
+        character.surfaces[0].colour, tiny.surfaces[0].colour
     )
-    image = character.surfaces[0].colour
-    column, row = np.floor(character.uv * len(image)).astype(int).T
-    expected = srgb(colours.astype(float))[tiny.faces.ravel()]
-    np.testing.assert_allclose(
-        image[row, column, :3] / 255, expected, atol=0.003
-    )
+    np.testing.assert_allclose(character.tint[:, :3], colours, atol=1e-6)
+    assert (character.tint[:, 3] == 1).all()
+    assert tiny.tint is None
+
+    # In linear light, at the corners of faces.
+    uv = tiny.uv[tiny.faces[:, 0]]
+    plain = tiny.surfaces[0].colour
+    size = np.array(plain.shape[1::-1])
+    column, row = (uv % 1 * size).astype(int).T
+    light = linear(plain[row, column, :3] / 255.0)
+    at = character.tint[character.faces[:, 0]]
+    expected = srgb(light * colours[tiny.faces[:, 0]])
+    lab = texture_lab(character, uv, character.material, at)
+    rgb = cv2.cvtColor(lab[:, None].astype("f4"), cv2.COLOR_LAB2RGB)[:, 0]
+    np.testing.assert_allclose(rgb, expected, atol=3e-3)
+
+
+@pytest.mark.parametrize("mode", [5, 6], ids=["strip", "fan"])
+def test_strips_and_fans_are_the_same_triangles(tmp_path, mode, tiny):
+    """A box's side is two triangles, in one strip or fan of four corners."""
+    glb = TinyGlb()
+    mesh = glb.doc.meshes[0]
+    whole = mesh.primitives[0]
+    quads = []
+    for first in range(0, len(tiny.vertices), 8):
+        quads += (first + SIDES).tolist()
+    mesh.primitives = []
+    for a, b, c, d in quads:
+        corners = [a, b, d, c] if mode == 5 else [a, b, c, d]
+        side = copy(whole)
+        side.mode = mode
+        side.indices = glb.accessor(np.array(corners, "u2")[:, None], "SCALAR")
+        mesh.primitives.append(side)
+    read = read_character(glb.write(tmp_path / "a.glb"))
+    areas = []
+    for character in (tiny, read):
+        corners = character.vertices[character.faces]
+        edges = corners[:, 1:] - corners[:, :1]
+        middle = corners.mean(axis=1)
+        normals = np.cross(edges[:, 0], edges[:, 1])
+        areas.append([(normals * middle).sum(), np.abs(normals).sum()])
+    np.testing.assert_allclose(areas[0], areas[1], rtol=1e-6)
 
 
 def test_a_texture_without_an_image_is_white(tmp_path):
@@ -573,13 +611,24 @@ def a_nan(glb: TinyGlb) -> None:
 AVIF = pygltflib.Texture(extensions={"EXT_texture_avif": {"source": 0}})
 
 
-def coloured(glb: TinyGlb) -> np.ndarray:
+def coloured(glb: TinyGlb, factor: float = 1.0) -> np.ndarray:
     """Gives the vertices colours, which it returns."""
     attributes = glb.doc.meshes[0].primitives[0].attributes
     count = glb.doc.accessors[attributes.POSITION].count
     colours = np.random.default_rng(0).random((count, 3)).astype("f4")
+    colours *= np.float32(factor)
     attributes.COLOR_0 = glb.accessor(colours, "VEC3")
     return colours
+
+
+def short_colours(glb: TinyGlb) -> None:
+    attributes = glb.doc.meshes[0].primitives[0].attributes
+    attributes.COLOR_0 = glb.accessor(np.ones((3, 3), "f4"), "VEC3")
+
+
+def emits_with_colours(glb: TinyGlb) -> None:
+    coloured(glb)
+    glb.doc.materials[0].emissiveFactor = [1, 1, 1]
 
 
 LEFT_HAND = list(BONES).index("LeftHand")
@@ -600,8 +649,13 @@ BAD = {
     "EXT_texture_avif is not supported": lambda glb: setattr(
         glb.doc, "textures", [AVIF]
     ),
-    "bake the colours into the texture": lambda glb: coloured(glb),
+    "emits light and its mesh has colours": emits_with_colours,
     "a face names a vertex": a_face_too_many,
+    "differ in their lengths": lambda glb: short_colours(glb),
+    "colours of vertices are not numbers": lambda glb: coloured(glb, np.nan),
+    "refers to an entry that is not there": lambda glb: setattr(
+        glb.doc.meshes[0].primitives[0], "material", 7
+    ),
     "not numbers": a_nan,
     "circle": lambda glb: setattr(glb.doc.nodes[3], "children", [0]),
     "damaged": lambda glb: setattr(glb.doc.accessors[0], "count", 10**6),

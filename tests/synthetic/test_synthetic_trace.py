@@ -138,6 +138,25 @@ def test_texture_is_upright():
     assert image[12, 12].min() > 0.3
 
 
+def test_colours_of_vertices_multiply_light_and_coverage():
+    """Half the light at the left, all at the right; cut out where coverage is below one half."""
+    view = from_above()
+    c = character([square(1.0, 0.5)], [plain(cutoff=0.5)])
+    image, _, _ = posed(c).render(view, 4)
+    tint = np.array(
+        [[0.5, 1, 0, 1], [1, 1, 0, 0], [1, 1, 0, 0], [0.5, 1, 0, 1]]
+    )
+    tinted, alpha, _ = posed(replace(c, tint=tint)).render(view, 4)
+    for x in (-0.4, -0.2):
+        share = 0.5 + 0.5 * (x + 0.5)
+        light = linear(at(view, image, (x, 0, 1.0)))
+        expected = light * [share, 1, 0]
+        found = linear(at(view, tinted, (x, 0, 1.0)))
+        np.testing.assert_allclose(found, expected, atol=0.01)
+    assert at(view, alpha, (-0.2, 0, 1.0)) == 1
+    assert at(view, alpha, (0.2, 0, 1.0)) == 0
+
+
 def test_fine_texture_is_averaged_as_light():
     checks = np.indices((512, 512)).sum(axis=0) % 2 * 255
     colours = np.dstack([checks] * 3 + [np.full((512, 512), 255)]).astype(

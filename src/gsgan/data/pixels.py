@@ -11,10 +11,17 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from gsgan.utils.arrays import Bool, Bytes
 from gsgan.utils.errors import DataError
-from gsgan.utils.image_files import read_alpha, read_grey, read_stored
+from gsgan.utils.image_files import (
+    read_alpha,
+    read_colour,
+    read_grey,
+    read_header,
+    read_stored,
+)
 
 OPAQUE = 250  # a lower value, alone beside 0, is no alpha of a person
 
@@ -96,11 +103,37 @@ def read_mask_values(path: Path) -> Bytes:
     Raises:
         DataError: if the file is missing, damaged or cut off.
     """
+    # Some tools number objects by palette.
+    if read_header(path)[2] == "P":
+        return _of_palette(path)
+
     # Some tools write masks as alpha over one colour, others cut the person out of the image.
     alpha = read_alpha(path)
     if alpha is not None and alpha.min() < alpha.max():
         return alpha
     return read_grey(path)
+
+
+def _of_palette(path: Path) -> Bytes:
+    """``[H, W]`` 0..255 of a palette PNG: its grey values, or 255 where its number is not 0.
+
+    Raises:
+        DataError: if it is damaged, or has more than two numbers in colours.
+    """
+    grey = read_grey(path)
+    colours = read_colour(path)
+    grey_levels = (colours == colours[..., :1]).all()
+    if grey_levels and (grey.max() >= OPAQUE or not grey.any()):
+        return grey
+    with Image.open(path) as image:
+        index = np.asarray(image)
+    objects = np.unique(index[index > 0])
+    if len(objects) > 1:
+        raise DataError(
+            f"{path} is a palette PNG with the numbers {', '.join(map(str, objects[:6]))} beside "
+            "0; expected one person: save a mask that is white where the person is"
+        )
+    return np.where(index > 0, np.uint8(255), np.uint8(0))
 
 
 def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:

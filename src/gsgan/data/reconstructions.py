@@ -18,6 +18,7 @@ from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.utils.arrays import Float
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json, read_text
+from gsgan.utils.frame_files import CAMERA_WORDS
 
 # COLMAP's camera models in the order of their numbers, with the numbers of their parameters.
 CAMERA_MODELS = {
@@ -55,8 +56,9 @@ ONE_FOCAL = (
 POINT_BYTES = 24
 # lengths in pixels in nerfstudio's files
 PIXEL_KEYS = frozenset({"fl_x", "fl_y", "cx", "cy"})
-# What parts the words of a file's name.
-SEPARATOR = re.compile(r"[_\-. ]+")
+# The words of a file's name, each with the number that ends it, and those that name a camera.
+WORD = re.compile(r"[^\W\d_]*\d+|[^\W\d_]+")
+CAMERA_WORD = re.compile(rf"({'|'.join(CAMERA_WORDS)})\d+", re.IGNORECASE)
 # Errors of reading a damaged file.
 DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 # OpenGL's camera axes, x right, y up, z backward, in OpenCV's.
@@ -164,21 +166,30 @@ def _namings(
 def _by_words(
     stems: Sequence[str], views: Sequence[CalibratedImage]
 ) -> list[dict[str, list[CalibratedImage]]]:
-    """The ways to group images of one folder by a word of their names where another, a number,
-    counts moments: frame_0001_cam1."""
-    words = [SEPARATOR.split(stem) for stem in stems]
+    """The ways to group images of one folder by a word of their names: the one that says cam1, or
+    one beside which another word counts moments, 0001 or frame0001."""
+    words = [WORD.findall(stem) for stem in stems]
     if len({len(parts) for parts in words}) != 1:
         return []
 
-    # Two words differ: one names the camera, the other counts.
+    # The word decides where all that differs besides are numbers.
     columns = [
         column for column in zip(*words, strict=True) if len(set(column)) > 1
     ]
-    if len(columns) != 2:
-        return []
     ways = []
+    for column in columns:
+        others = [c for c in columns if c is not column]
+        counted = all(word[-1].isdigit() for c in others for word in c)
+        if counted and all(map(CAMERA_WORD.fullmatch, column)):
+            ways.append(_group(column, views))
+    if len(columns) != 2:
+        return ways
+
+    # Two words differ: one names the camera, the other counts.
     for names, moments in permutations(columns, 2):
-        if all(map(str.isdigit, moments)) and len(set(names)) < len(views):
+        before = {moment.rstrip("0123456789") for moment in moments}
+        counts = len(before) == 1 and before.isdisjoint(moments)
+        if counts and len(set(names)) < len(views):
             ways.append(_group(names, views))
     return ways
 

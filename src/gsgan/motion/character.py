@@ -50,6 +50,8 @@ class Character:
     # [L] the bone whose joint is the landmark, -1 for vertices
     anchor_joint: Ints
     anchor_vertex: Ints  # [L] the vertex that is the landmark, -1 for joints
+    # [V, 4] factors of linear colour and of coverage; None: 1
+    tint: Array | None = None
 
     def skin(
         self, rotations: Array, joints: Array, offsets: Array | None = None

@@ -183,6 +183,8 @@ def _with_missing(clip: Clip) -> Clip:
     if not visibility.any():
         visibility = np.ones_like(visibility)
     known = np.isfinite(p).all(-1)
+    if not known.any():
+        raise ValueError("no joint of any frame has a position")
     return replace(clip, p=p, visibility=np.where(known, visibility, 0.0))
 
 

@@ -92,6 +92,7 @@ def find_joints(names: tuple[str, ...]) -> dict[str, int]:
     """
     joints: dict[str, int] = {}
     ranks: dict[str, int] = {}
+    feet: dict[str, int] = {}
     for j, name in enumerate(plain_names(names)):
         # MakeHuman's helpers and end sites are no bones.
         if name.startswith("__") or name.endswith(" end"):
@@ -100,6 +101,13 @@ def find_joints(names: tuple[str, ...]) -> dict[str, int]:
         if bone and rank < ranks.get(bone, 99):
             joints[bone] = j
             ranks[bone] = rank
+        if bone.endswith("Foot") and rank > 1:
+            feet[bone] = j
+
+    # Beside ankles, SMPL calls the toes feet.
+    for bone, j in feet.items():
+        if joints[bone] != j:
+            joints.setdefault(bone.replace("Foot", "ToeBase"), j)
     return joints
 
 

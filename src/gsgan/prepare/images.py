@@ -1,7 +1,7 @@
 """Images and masks of the finished capture: found, cleaned, undistorted, scaled, written."""
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,15 @@ from gsgan.data.pixels import read_mask_values
 from gsgan.prepare.matting import Room, cut_out, tidy
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
-from gsgan.utils.arrays import Bytes
+from gsgan.utils.arrays import Bytes, evenly_spaced
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 from gsgan.utils.frame_files import frame_files
+from gsgan.utils.image_files import read_header, refuse_deep
 
 JPEG_QUALITY = 95  # of jpg, 1 to 100
+DECODED = 12  # masks of a camera whose values are looked at
+MIDDLE = 128  # of the values of a mask
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
 
@@ -46,7 +49,7 @@ def find_masks(
     """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
 
     Raises:
-        DataError: when a camera has none.
+        DataError: when a camera has none, or their values are no alpha.
     """
     masks = {}
     for name in names:
@@ -69,7 +72,26 @@ def find_masks(
                 f"{place} holds no masks; expected {name}/000000.png and so on"
             )
         masks[name] = {number: folder / path for number, path in files.items()}
+        _refuse_other_values(place, list(masks[name].values()))
     return masks
+
+
+def _refuse_other_values(folder: Path, masks: Sequence[Path]) -> None:
+    """Refuses a camera's masks that are no alpha of 8 bits.
+
+    Raises:
+        DataError: when one has more bits, or some that are decoded never reach the middle.
+    """
+    for path in masks:
+        refuse_deep(path, read_header(path)[1])
+    highest = 0
+    for k in evenly_spaced(len(masks), DECODED):
+        highest = max(highest, int(read_mask_values(masks[k]).max()))
+    if 0 < highest < MIDDLE:
+        raise DataError(
+            f"{folder}: masks never exceed {highest}; expected alpha from 0 to 255, and 255 where "
+            "the person is (save them in black and white, or multiply them)"
+        )
 
 
 def _first_number(stem: str) -> int:

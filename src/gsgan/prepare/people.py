@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,13 +27,19 @@ SMALL_STEP = 0.05
 MAX_FAILED = 0.5  # share of the frames with several people in which no two cameras may agree
 
 
+# Metres, and metres a second, above which a person from frame to frame is another one.
+MAX_JUMP = 0.5
+MAX_SPEED = 12.0
+STAYS = 3  # frames before and after a jump, of which all must be apart
+
+
 class _Group(NamedTuple):
     """One person in one frame."""
 
     chosen: tuple[
         int, ...
     ]  # number of the person in each camera, -1 = not seen
-    centre: Float  # [3]
+    p: Float  # [33, 3] joints, NaN = not seen
     size: float  # diagonal of the joints' box, in the unit of the cameras
     confidence: float  # sum over cameras and joints
 
@@ -112,6 +118,35 @@ def find_crowds(
         offset = int(offsets.get(name, 0))
         several.update(number + offset for number in detected.crowded)
     return several
+
+
+def find_jumps(p: Float, time: Float) -> list[int]:
+    """The rows of joints ``p [F, J, 3]``, metres, before which the person jumps, to stay there.
+
+    Args:
+        p: NaN = not seen.
+        time: ``[F]`` seconds.
+    """
+    rows = np.flatnonzero(is_known(p).sum(1) >= MIN_JOINTS)
+    jumps = []
+    for k in range(1, len(rows) - STAYS + 1):
+        before = p[rows[max(0, k - STAYS) : k]]
+        after = p[rows[k : k + STAYS]]
+        seconds = time[rows[k]] - time[rows[k - 1]]
+        reach = max(MAX_JUMP, MAX_SPEED * seconds)
+        apart = [_move(*pair) for pair in product(before, after)]
+        if min(apart) > reach:
+            jumps.append(int(rows[k]))
+    return jumps
+
+
+def _move(before: Float, after: Float) -> float:
+    """The distance between two poses ``[J, 3]``, by the joints of both; 0 without any."""
+    apart = after - before
+    both = apart[is_known(apart)]
+    if not len(both):
+        return 0.0
+    return float(np.linalg.norm(np.median(both, axis=0)))
 
 
 def _only(found: Detections, chosen: Mapping[int, int]) -> Detections:
@@ -208,8 +243,7 @@ def _group(
     # Its place and size.
     there = p[is_known(p)]
     size = float(np.linalg.norm(np.ptp(there, axis=0)))
-    centre = np.median(there, axis=0)
-    return _Group(tuple(chosen), centre, size, confidence)
+    return _Group(tuple(chosen), p, size, confidence)
 
 
 def _error(
@@ -265,8 +299,8 @@ def _way(steps: Sequence[Sequence[_Group]]) -> list[_Group | None]:
 
 
 def _step(before: _Group, after: _Group) -> float:
-    """The distance between two groups, in sizes of the person."""
-    return float(np.linalg.norm(after.centre - before.centre)) / after.size
+    """The distance between two groups, in sizes of the person, by the joints of both."""
+    return _move(before.p, after.p) / max(before.size, after.size)
 
 
 def _free_step(steps: Sequence[Sequence[_Group]]) -> float:

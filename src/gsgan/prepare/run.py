@@ -44,7 +44,7 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import find_crowds, one_person
+from gsgan.prepare.people import find_crowds, find_jumps, one_person
 from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -61,6 +61,9 @@ from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
+MIN_IMAGES = (
+    0.2  # share of the frames of the camera with most that each must have
+)
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 
 
@@ -115,7 +118,10 @@ def prepare(options: Options, console: Console | None = None) -> Path:
     )
     write_files(root, outcome, key)
     numbers = summarise(outcome) | solved.numbers
-    numbers["clock_errors"] = _clock_errors(outcome, solved.drift)
+    numbers["errors"] = [
+        *_clock_errors(outcome, solved.drift),
+        *_short_cameras(outcome),
+    ]
     write_json(root / "prepare.json", numbers)
     publish(root, out)
 
@@ -189,6 +195,7 @@ def _from_several(
         inputs = _in_metres(options, inputs, uv, conf)
 
     # The joints, and the clocks of the cameras.
+    inputs = _with_first_look(inputs, frames, uv, conf)
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
     solution = _solve_frames(options, inputs, frames, uv, conf, alphas, console)
@@ -337,11 +344,25 @@ def _clock_errors(outcome: Outcome, drift: Float) -> list[str]:
     return errors or (late.notes if late.wrong else [])
 
 
+def _short_cameras(outcome: Outcome) -> list[str]:
+    """A sentence for each camera with an image in few of the frames that others have."""
+    counts = {name: len(frames) for name, frames in outcome.written.items()}
+    most = max(counts.values())
+    errors = []
+    for name, count in counts.items():
+        if count < MIN_IMAGES * most:
+            errors.append(
+                f"{name} has images with a mask in {count} of {most} frames: copy its images and "
+                "masks again, or leave it out of the source"
+            )
+    return errors
+
+
 def _refuse_errors(out: Path) -> None:
-    """Raises a DataError if the clocks of the dataset are wrong, or its check has found errors."""
-    clocks = read_json(out / "prepare.json").get("clock_errors")
-    if clocks:
-        raise DataError(f"{out} was written, but {'; '.join(clocks)}")
+    """Raises a DataError if a camera of the dataset is of no use, or its check has found errors."""
+    wrong = read_json(out / "prepare.json").get("errors")
+    if wrong:
+        raise DataError(f"{out} was written, but {'; '.join(wrong)}")
     findings = read_json(out / "check.json")["findings"]
     errors = []
     for finding in findings:
@@ -578,12 +599,7 @@ def _solve_frames(
     console: Console,
 ) -> Solution:
     """The joints and cameras that fit undistorted pixels, see `_undistort`."""
-    # A quick solution shows cameras in a wrong unit before the long one begins.
     cameras = CameraArray.of(inputs.cameras)
-    C = len(cameras)
-    flat_uv = uv.reshape(C, -1, 2)
-    p = plain(cameras, flat_uv, conf.reshape(C, -1))
-    _check_distance(inputs, p)
     offsets = options.offsets or {}
     numbers = {name: frames - offsets.get(name, 0) for name in inputs.sources}
     outlines = find_outlines(inputs.cameras, alphas, numbers)
@@ -596,6 +612,29 @@ def _solve_frames(
             outlines=outlines,
             settings=options.solve,
         )
+
+
+def _with_first_look(
+    inputs: Inputs, frames: Ints, uv: Float, conf: Float
+) -> Inputs:
+    """The inputs with a note on a person who jumps, by a quick solution, see `_undistort`.
+
+    Raises:
+        DataError: on cameras in a wrong unit, before the long solution begins.
+    """
+    cameras = CameraArray.of(inputs.cameras)
+    C, F, J = uv.shape[:3]
+    p = plain(cameras, uv.reshape(C, -1, 2), conf.reshape(C, -1))
+    _check_distance(inputs, p)
+    jumps = find_jumps(p.reshape(F, J, 3)[:, :BODY], frames / inputs.fps)
+    if not jumps:
+        return inputs
+    before, after = frames[jumps[0] - 1], frames[jumps[0]]
+    note = (
+        f"doubtful: the person is elsewhere from frame {before} to {after}, as in {len(jumps)} "
+        "frames: another person may follow; prepare each part alone with frames="
+    )
+    return replace(inputs, notes=[*inputs.notes, note])
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:

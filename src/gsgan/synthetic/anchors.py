@@ -233,7 +233,11 @@ class _Face:
         self.vertex = np.where(face >= 0, nearest[:, 0], -1).reshape(shape)
         self.hair = (c.labels[face] == LABEL_NAMES.index("hair")).reshape(shape)
         uv = np.einsum("nk,nki->ni", share, c.uv[corners])
-        self.lab = texture_lab(c, uv, c.material[face]).reshape(*shape, 3)
+        tint = None
+        if c.tint is not None:
+            tint = np.einsum("nk,nki->ni", share, c.tint[corners])
+        lab = texture_lab(c, uv, c.material[face], tint)
+        self.lab = lab.reshape(*shape, 3)
 
         # Metres that the open mouth lowers each hit.
         self.drop = None

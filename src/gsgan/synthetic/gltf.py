@@ -71,7 +71,7 @@ STRENGTH = "KHR_materials_emissive_strength"
 UNLIT = "KHR_materials_unlit"
 CHARACTER_FILES = (".glb", ".gltf", ".vrm")
 UPRIGHT = 0.7  # cosine between the way from hips to head and the vertical
-TRIANGLES = 4  # glTF's number of this primitive mode
+TRIANGLES, STRIP, FAN = 4, 5, 6  # glTF's numbers of these primitive modes
 AVATAR_FILES = sorted(Path(__file__).with_name("avatars").glob("*.glb"))
 AVATARS = {path.stem: path for path in AVATAR_FILES}
 """Files of the avatars that come with gsgan, by name."""
@@ -102,6 +102,8 @@ def read_character(path: Path) -> Character:
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
+        if isinstance(error, IndexError):
+            reason = "it refers to an entry that is not there"
         raise DataError(
             f"{path}: damaged ({reason}); export the character again"
         ) from error
@@ -231,7 +233,7 @@ class _Part:
     bone_index: Ints  # [V, 4]
     bone_weight: Array  # [V, 4], sums to 1
     shapes: dict[str, Array]  # [V, 3] offsets by plain name
-    surface: Surface | None = None  # of its own, in place of the material
+    tint: Array  # [V, 4] factors of linear colour and of coverage
 
 
 class _Binding(NamedTuple):
@@ -250,7 +252,7 @@ def _parts(glb: GltfFile, skeleton: _Skeleton) -> list[_Part]:
         if node.mesh is None or not on_bone:
             continue
         for primitive in glb.doc.meshes[node.mesh].primitives:
-            if primitive.mode in (None, TRIANGLES):
+            if primitive.mode in (None, TRIANGLES, STRIP, FAN):
                 parts.append(_part(glb, skeleton, i, primitive))
     return parts
 
@@ -265,6 +267,9 @@ def _part(
     }
 
     glb.decompress(primitive)
+    counts = {glb.doc.accessors[k].count for k in attributes.values()}
+    if len(counts) > 1:
+        raise ValueError("attributes of one mesh differ in their lengths")
 
     # Positions and normals in world axes. Missing normals are made of the faces later.
     position = glb.accessor(attributes["POSITION"])
@@ -289,30 +294,33 @@ def _part(
         uv = glb.accessor(attributes[f"TEXCOORD_{layout.uv_set}"])
     uv = _transform_uv(uv, layout.transform)
 
-    # Colours of vertices multiply the base colour.
-    colours = np.ones((len(position), 4))
-    if "COLOR_0" in attributes:
-        given = glb.accessor(attributes["COLOR_0"])
-        colours[:, : given.shape[1]] = given
-    if primitive.material is None or _is_opaque(
-        glb.doc.materials[primitive.material]
-    ):
-        colours[:, 3] = 1
-
     # Exporters store the names of shapes with the mesh or with the primitive.
     names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
-    part = _Part(
+    return _Part(
         name=f"{node.name} {mesh.name}",
         material=-1 if primitive.material is None else primitive.material,
         vertices=_transform(linear, position) + binding.to_world[:, :3, 3],
         normals=normals,
         uv=uv,
-        faces=corners[: len(corners) // 3 * 3].reshape(-1, 3),
+        faces=_faces(corners, primitive.mode),
         bone_index=binding.bones,
         bone_weight=binding.weights,
         shapes=_shapes(glb, names, primitive.targets or (), linear),
+        tint=_tint(glb, primitive, attributes, len(position)),
     )
-    return part if (colours == 1).all() else _paint(glb, part, colours)
+
+
+def _faces(corners: Ints, mode: int | None) -> Ints:
+    """``[F, 3]`` vertices of the triangles, strip or fan of ``corners``."""
+    if mode == STRIP:
+        # Every other triangle of a strip runs the other way round.
+        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+        return faces
+    if mode == FAN:
+        first = np.full(len(corners) - 2, corners[0])
+        return np.stack([first, corners[1:-1], corners[2:]], axis=1)
+    return corners[: len(corners) // 3 * 3].reshape(-1, 3)
 
 
 def _transform_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
@@ -324,54 +332,32 @@ def _transform_uv(uv: Array, transform: Mapping[str, Any]) -> Array:
     return turned + transform.get("offset", (0, 0))
 
 
-def _paint(glb: GltfFile, part: _Part, colours: Array) -> _Part:
-    """A part whose colours of vertices ``[V, 4]``, linear, are a texture: 2 x 2 pixels for each
-    face, in which colours go on beyond its third corner.
+def _tint(
+    glb: GltfFile, primitive: Any, attributes: dict[str, int], count: int
+) -> Array:
+    """``[V, 4]`` colours of the ``count`` vertices, which multiply the base colour.
 
     Raises:
-        DataError: when it has a texture too.
+        DataError: when the material also emits light, which they do not multiply.
     """
-    if part.material >= 0 and _base_texture(glb, part.material) is not None:
+    tint = np.ones((count, 4))
+    if "COLOR_0" in attributes:
+        given = glb.accessor(attributes["COLOR_0"])
+        tint[:, : given.shape[1]] = given
+        if not np.isfinite(tint).all():
+            raise ValueError("colours of vertices are not numbers")
+    if primitive.material is None:
+        tint[:, 3] = 1
+        return tint
+    material = glb.doc.materials[primitive.material]
+    if _is_opaque(material):
+        tint[:, 3] = 1
+    if (tint != 1).any() and _emission(material).any():
         raise DataError(
-            f"{glb.path}: {part.name} has colours of vertices and a texture; bake the colours into "
-            "the texture"
+            f"{glb.path}: {material.name or 'a material'} emits light and its mesh has colours of "
+            "vertices; bake both into the base colour's texture"
         )
-    plain = _surface(glb, part.material)
-    factor = plain.colour[0, 0] / 255
-    light = colours * [*linear(factor[:3]), factor[3]]
-
-    # The colours of the four pixels of each face, in a square of such blocks.
-    a, b, c = light[part.faces].transpose(1, 0, 2)
-    blocks = np.stack([a, b, c, b + c - a], axis=1).clip(0, 1)
-    F = len(part.faces)
-    side = int(np.ceil(np.sqrt(F)))
-    row, column = np.divmod(np.arange(F), side)
-    image = np.ones((2 * side, 2 * side, 4))
-    corners = ((0, 0), (0, 1), (1, 0), (1, 1))
-    for k, (down, right) in enumerate(corners):
-        image[2 * row + down, 2 * column + right] = blocks[:, k]
-    image[..., :3] = srgb(image[..., :3])
-    pixels = np.rint(255 * image).astype(np.uint8)
-    if plain.cutoff == 0:
-        pixels[..., 3] = 255
-
-    # Each face gets vertices of its own, at the centres of its pixels.
-    uv = np.empty((F, 3, 2))
-    for k, (down, right) in enumerate(corners[:3]):
-        uv[:, k, 0] = (2 * column + right + 0.5) / (2 * side)
-        uv[:, k, 1] = (2 * row + down + 0.5) / (2 * side)
-    at = part.faces.ravel()
-    return replace(
-        part,
-        surface=replace(plain, colour=pixels),
-        vertices=part.vertices[at],
-        normals=part.normals[at],
-        uv=uv.reshape(-1, 2),
-        faces=np.arange(3 * F).reshape(F, 3),
-        bone_index=part.bone_index[at],
-        bone_weight=part.bone_weight[at],
-        shapes={name: shape[at] for name, shape in part.shapes.items()},
-    )
+    return tint
 
 
 def _transform(matrices: np.ndarray, vectors: Array) -> Array:
@@ -541,6 +527,16 @@ def _surface(glb: GltfFile, material: int) -> Surface:
     )
 
 
+def _emission(entry: Any) -> Array:
+    """``[3]`` linear light that a material emits, before its texture."""
+    extensions = entry.extensions or {}
+    strength = extensions.get(STRENGTH, {}).get("emissiveStrength", 1.0)
+    factor: Array = strength * np.array(
+        entry.emissiveFactor or (0, 0, 0), float
+    )
+    return factor
+
+
 def _with_emission(
     glb: GltfFile, entry: Any, shared: _UvLayout, colour: Bytes
 ) -> Bytes:
@@ -552,9 +548,7 @@ def _with_emission(
         shared: the layout of all its textures.
         colour: of the material.
     """
-    extensions = entry.extensions or {}
-    strength = extensions.get(STRENGTH, {}).get("emissiveStrength", 1.0)
-    factor = strength * np.array(entry.emissiveFactor or (0, 0, 0), np.float64)
+    factor = _emission(entry)
     if not factor.any():
         return colour
     emitted = np.full((1, 1, 4), 255, np.uint8)
@@ -707,8 +701,7 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
 
     # The material and the name of each face's part.
     counts = [len(part.faces) for part in parts]
-    plain = {part.material for part in parts if part.surface is None}
-    materials = sorted(plain)
+    materials = sorted({part.material for part in parts})
     surfaces = [_surface(glb, number) for number in materials]
     if UNLIT in (glb.doc.extensionsUsed or ()):
         logger.warning(
@@ -716,13 +709,8 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
             glb.path,
             UNLIT,
         )
-    material = []
-    for part in parts:
-        if part.surface is None:
-            material.append(materials.index(part.material))
-        else:
-            material.append(len(surfaces))
-            surfaces.append(part.surface)
+    material = [materials.index(part.material) for part in parts]
+    tint = np.concatenate([part.tint for part in parts])
     names = np.repeat([part.name for part in parts], counts)
 
     # Labels and landmarks need a character, so they are added afterwards.
@@ -745,6 +733,7 @@ def _character(glb: GltfFile, skeleton: _Skeleton) -> Character:
         anchor_names=(),
         anchor_joint=np.zeros(0, np.int64),
         anchor_vertex=np.zeros(0, np.int64),
+        tint=tint if (tint != 1).any() else None,
     )
     labels = face_labels(character, names)
     return with_anchors(replace(character, labels=labels))

@@ -11,6 +11,7 @@ from trimesh.graph import connected_component_labels
 
 from gsgan.motion.character import Character, Ints
 from gsgan.motion.rotations import Array
+from gsgan.synthetic.textures import linear, srgb
 
 # The names of the free body's parts, in the same order.
 LABEL_NAMES = (
@@ -193,14 +194,19 @@ def _label_of(name: str) -> int:
     return 0
 
 
-def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
-    """``[N, 3]`` CIELAB colours of the materials ``[N]`` at texture coordinates ``[N, 2]``."""
+def texture_lab(
+    c: Character, uv: Array, material: Ints, tint: Array | None
+) -> Array:
+    """``[N, 3]`` CIELAB colours of the materials ``[N]`` at texture coordinates ``[N, 2]``, with
+    factors ``tint [N, 4]`` of linear colour."""
     colour = np.zeros((len(uv), 3))
     for m, surface in enumerate(c.surfaces):
         at = material == m
         h, w = surface.colour.shape[:2]
         texel = np.minimum(uv[at] % 1 * (w, h), (w - 1, h - 1)).astype(int)
         colour[at] = surface.colour[texel[:, 1], texel[:, 0], :3] / 255
+    if tint is not None:
+        colour[:] = srgb(linear(colour) * tint[:, :3])
     lab = cv2.cvtColor(colour[:, None].astype(np.float32), cv2.COLOR_RGB2LAB)[
         :, 0
     ]
@@ -212,7 +218,11 @@ def _lab(c: Character) -> Array:
     # Barycentric weights of the middle and of a point near each corner.
     points = np.vstack([np.full((1, 3), 1 / 3), 0.2 + 0.4 * np.eye(3)])
     uv = np.einsum("pk,fkd->pfd", points, c.uv[c.faces])
-    lab = np.mean([texture_lab(c, at, c.material) for at in uv], axis=0)
+    tint: Array | list[None] = [None] * len(points)
+    if c.tint is not None:
+        tint = np.einsum("pk,fkd->pfd", points, c.tint[c.faces])
+    each = zip(uv, tint, strict=True)
+    lab = np.mean([texture_lab(c, at, c.material, by) for at, by in each], 0)
     return lab * np.array([0.5, 1, 1])
 
 

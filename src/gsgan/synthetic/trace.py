@@ -128,6 +128,9 @@ class Appearance:
         uv = _blend(bary[k], self.uv[self.faces[face[k]]])
         finest = np.zeros(len(k), np.int64)
         _, coverage, _ = self.textures(surface[k], uv, finest)
+        if self.character.tint is not None:
+            corners = self.character.tint[self.faces[face[k]], 3:]
+            coverage = coverage * _blend(bary[k], corners)[:, 0]
         solid[k] = coverage >= cutoff[k]
         return solid
 
@@ -247,10 +250,12 @@ class PosedCharacter:
 
         # Attributes of the vertices, in the columns that `_shade` reads: position, normal, sky
         # light outside and inside, texture coordinates, and the phase, slope and direction of
-        # wrinkles. One lookup interpolates them all.
+        # wrinkles; last, factors of colour. One lookup interpolates them all.
         attributes = [X, N, self._sky(X, N), appearance.uv]
         if wrinkles is not None:
             attributes += [wrinkles.phase, wrinkles.slope, wrinkles.across]
+        if appearance.character.tint is not None:
+            attributes.append(appearance.character.tint[:, :3])
         self.attributes = np.column_stack(attributes).astype(np.float32)
 
     def render(self, view: SceneCamera, rays: int) -> tuple[Array, Array, Ints]:
@@ -365,6 +370,8 @@ class PosedCharacter:
             uv=here[:, 8:10],
             level=np.rint(level).astype(np.int64),
         )
+        if looks.character.tint is not None:
+            colour = colour * here[:, -3:]
 
         # The back of cloth is lit on its own side.
         normal = self._shading_normal(here, face, bump)

@@ -25,7 +25,10 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_class, get_method, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import (
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+)
 from rich.console import Console
 
 from gsgan.utils.errors import ConfigError, GsganError
@@ -50,6 +53,8 @@ GONE = {
 # An element of a list on the command line: in quotes, or up to the next comma.
 ELEMENT = re.compile(r"""\s*('[^']*'|"[^"]*"|[^,]+?)\s*(?:,|$)""")
 SWEEPS = ("-m", "--multirun")
+# What OmegaConf would read as the value of another key, ${HOME}, and not as a call, ${now:%H}.
+REFERENCE = re.compile(r"(\\*)\$\{(?![\w.]+:.*\})")
 
 # Keys of a dataset that are paths, and where a config holds a dataset.
 DATA_PATHS = ("root", "smpl", "source.avatar", "source.motion")
@@ -184,6 +189,9 @@ def build(value: Any, **further: Any) -> Any:
     """
     if not OmegaConf.is_config(value):
         return value
+    # Hydra would resolve text with ${ twice.
+    if OmegaConf.is_list(value) and all(isinstance(one, str) for one in value):
+        return list(value)
     try:
         return instantiate(value, _convert_="all", **further)
     except InstantiationException as error:
@@ -214,7 +222,9 @@ def paths_as_text(config: DictConfig) -> None:
         if isinstance(value, (bool, int, float)):
             OmegaConf.update(config, key, str(value))
         elif isinstance(value, ListConfig):
-            OmegaConf.update(config, key, [str(path) for path in value])
+            # Not resolved: text with ${ keeps its backslash.
+            listed = OmegaConf.to_container(value, resolve=False) or ()
+            OmegaConf.update(config, key, [str(path) for path in listed])
 
 
 def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -418,6 +428,10 @@ def quote(argument: str, sweep: bool = False) -> str:
         return argument
     name = key.lstrip("+")
 
+    # A backslash makes text of a reference to another key; keys of a group may have references.
+    if name in PATHS and "." not in name:
+        value = REFERENCE.sub(r"\1\1\\${", value)
+
     # A list of paths, each of them as typed.
     listed = value.startswith("[") and value.endswith("]")
     if name in PATH_LISTS and listed:
@@ -433,9 +447,11 @@ def quote(argument: str, sweep: bool = False) -> str:
     ):
         return f"{key}={value}"
 
-    # No value at all, or text.
+    # No value at all, or text; OmegaConf's mark of a missing value is none.
     if value == "null":
         return argument
+    if value == "???":
+        value = "./???"
     return f"{key}={_as_text(value)}"
 
 
@@ -503,6 +519,12 @@ def one_sentence(error: BaseException) -> str | None:
         return (
             f"{error.filename or 'a file'} cannot be written ({error.strerror}): make room, then "
             "start the same command again"
+        )
+    if isinstance(error, InterpolationResolutionError):
+        where = f"{error.full_key}: " if error.full_key else ""
+        return (
+            f"{where}{str(error).splitlines()[0]}; ${{…}} takes the value of another key, so a "
+            "path that holds it needs another name"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from decimal import Decimal
 from functools import lru_cache
@@ -14,6 +14,10 @@ import numpy as np
 from gsgan.utils.errors import DataError
 
 DIGITS = re.compile(r"[0-9]+")
+# A number with the word before it, such as frame0012, cam_1, or 000012.
+WORD_NUMBER = re.compile(r"([^\W\d_]*)[_\- ]?[0-9]+")
+FRAME_WORDS = frozenset({"f", "fr", "frame", "frames"})
+CAMERA_WORDS = frozenset({"c", "cam", "camera", "view"})
 # frame numbers beyond it are dates or damage
 LARGEST_FRAME = 10**9
 
@@ -179,10 +183,12 @@ def find_shifts(
 def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
     """The function that gives the frame number of each of these stems.
 
-    It is the last group of digits that differs between the stems: ``frame0012_cam1``,
-    ``000012_0``. Names often have other numbers in front, such as a date; numbers too large for
-    frames, such as times, do not count where another one differs: ``000012_1698765432``.
+    It is the last group of digits that differs between the stems: ``000012_0``. Words come first:
+    ``frame`` names the number, and ``cam`` another one, as in ``frame0012_cam1``. Names often have
+    other numbers in front, such as a date; numbers too large for frames, such as times, do not
+    count where another one differs: ``000012_1698765432``.
     """
+    stems = list(stems)
     groups = [DIGITS.findall(stem) for stem in stems]
     place = -1
     if len({len(group) for group in groups}) == 1:
@@ -195,13 +201,30 @@ def counting(stems: Iterable[str]) -> Callable[[str], int | None]:
             for i in differing
             if all(frame_of(group[i]) is not None for group in groups)
         ]
-        place = (usable or differing or [-1])[-1]
+        words = [WORD_NUMBER.findall(stem.lower()) for stem in stems]
+        places = usable or differing or list(range(len(groups[0])))
+        place = _by_word(places, words)
 
     def number(stem: str) -> int | None:
         digits = DIGITS.findall(stem)
         return frame_of(digits[place]) if digits else None
 
     return number
+
+
+def _by_word(places: Sequence[int], words: Sequence[Sequence[str]]) -> int:
+    """The last of some groups of digits that follows a word for frames, else no word for cameras,
+    else the last one; -1 without groups.
+
+    Args:
+        places: of the groups.
+        words: by stem, the word before each of its groups.
+    """
+    for allowed in (FRAME_WORDS.__contains__, lambda w: w not in CAMERA_WORDS):
+        for place in reversed(places):
+            if all(allowed(before[place]) for before in words):
+                return place
+    return places[-1] if places else -1
 
 
 def last_number(stem: str) -> int | None:

@@ -93,20 +93,21 @@ def check_image(
             f"{path} is {found[1]}x{found[0]} pixels (width x height), but "
             f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
-    _refuse_deep(path, depth)
+    refuse_deep(path, depth)
     if kind == "labels" and depth != 8:
         raise DataError(f"{path} has {depth} bits a channel; expected 8")
     if mode == "CMYK":
         raise DataError(
             f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)"
         )
-    if (mode == "P" and kind != "image") or (kind == "labels" and mode != "L"):
+    if kind == "labels" and mode != "L":
         raise DataError(
             f"{path} is a palette PNG or has colours; expected 8-bit grey values for a {kind} file"
         )
 
 
-def _refuse_deep(path: Path, depth: int) -> None:
+def refuse_deep(path: Path, depth: int) -> None:
+    """Refuses a file of more than 8 bits a channel."""
     if depth > 8:
         raise DataError(
             f"{path} has {depth} bits a channel; expected 8 (save it as 8-bit)"
@@ -121,7 +122,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
             bits.
     """
     # OpenCV would divide 16 bits by 256, which makes 12 bits black.
-    _refuse_deep(path, read_header(path)[1])
+    refuse_deep(path, read_header(path)[1])
 
     # OpenCV decodes to BGR.
     image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
