@@ -14,6 +14,7 @@ from make import skeletons
 
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.clocks import (
+    ClockErrors,
     by_time,
     clock_errors,
     moments,
@@ -216,14 +217,15 @@ FRAMES = np.arange(120)
     [(0, 10.3, 0), (0, 0.6, 0, 0), (0, 2.5, 0, -7.2), (0, 12.4), (0, 0, 0)],
 )
 def test_late_clocks_are_measured_to_a_tenth_of_a_frame(late):
-    delay, gain = clock_errors(*filmed([FRAMES + d for d in late]))
+    delay, gain, other = clock_errors(*filmed([FRAMES + d for d in late]))
     np.testing.assert_allclose(delay, late, atol=0.1)
     assert (gain[np.array(late) > 1] > 0.3).all()
+    assert np.isnan(other).all()
 
     # The advice, followed once, leaves less than half a frame.
     followed = [FRAMES + d - round(d) for d in delay]
     shown = [t + d - e for t, d, e in zip(followed, late, delay, strict=True)]
-    rest, _ = clock_errors(*filmed(shown))
+    rest = clock_errors(*filmed(shown)).delay
     assert np.abs(rest).max() <= 0.6
 
 
@@ -244,7 +246,11 @@ def test_a_clock_that_is_a_frame_late_is_an_error(delay, offsets, wrong):
         inputs=SimpleNamespace(sources=("a", "b")),
         options=SimpleNamespace(offsets=offsets),
         solution=SimpleNamespace(
-            delay=np.array([0.0, delay]), gain=np.array([0.0, 0.5])
+            clocks=ClockErrors(
+                delay=np.array([0.0, delay]),
+                gain=np.array([0.0, 0.5]),
+                other=np.array([np.nan, np.nan]),
+            )
         ),
     )
     clocks = late_clocks(outcome)
@@ -252,6 +258,28 @@ def test_a_clock_that_is_a_frame_late_is_an_error(delay, offsets, wrong):
     corrected = (offsets or {}).get("b", 0) + round(delay)
     if abs(delay) > 0.5:
         assert f"offsets={{b: {corrected}}}" in clocks.notes[0]
+
+
+@pytest.mark.parametrize("period", [24, 31.5])
+@pytest.mark.parametrize("late", [0, 7, -11.4])
+def test_a_motion_that_repeats_itself_has_other_delays(period, late):
+    """As jumping jacks: the delay is one of those that are whole periods apart, and both are
+    named."""
+    times = [FRAMES, FRAMES + late, FRAMES]
+    clocks = clock_errors(*filmed([time % period for time in times]))
+    off = (clocks.delay[1] - late) / period
+    assert off == pytest.approx(round(off), abs=0.03)
+    between = (clocks.other[1] - clocks.delay[1]) / period
+    assert round(between)
+    assert between == pytest.approx(round(between), abs=0.1)
+    outcome = SimpleNamespace(
+        frames=np.arange(10),
+        inputs=SimpleNamespace(sources=("a", "b", "c")),
+        options=SimpleNamespace(offsets=None),
+        solution=SimpleNamespace(clocks=clocks),
+    )
+    notes = late_clocks(outcome).notes
+    assert all("the motion repeats itself" in note for note in notes)
 
 
 def test_a_camera_that_loses_frames_without_a_gap_is_named():

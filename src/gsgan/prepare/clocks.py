@@ -32,6 +32,9 @@ MIN_MATCHES = 30  # joints in common, of all frames
 OUTLIER = 3.0  # times the median error: a joint that contradicts every lag
 ITERATIONS = 10  # of reweighting
 CERTAIN = 0.1  # frames: pairs of cameras that agree within it have full weight
+SIMILAR = 1.3  # times the least error: another delay fits nearly as well
+EQUAL = 1.1  # times the least error: a lag fits as well
+APART = 5  # frames between delays that are told apart
 DRIFT = 0.7  # frames between the first and the last third: a clock that is not steady
 DRIFT_LAG = 6  # frames by which it may change, either way
 DRIFT_GAIN = 0.1  # share of the error of a third that the change must explain
@@ -186,9 +189,23 @@ def renumber(
     return result
 
 
+class ClockErrors(NamedTuple):
+    """How late the clocks of cameras are; each ``[C]``.
+
+    Args:
+        delay: frames, NaN where it is unknown.
+        gain: the share by which the median error falls when the delay is corrected.
+        other: frames, a delay that fits nearly as well where the motion repeats itself, else NaN.
+    """
+
+    delay: Float
+    gain: Float
+    other: Float
+
+
 def clock_errors(
     cameras: CameraArray, uv: Float, weight: Float, max_lag: int = LAG
-) -> tuple[Float, Float]:
+) -> ClockErrors:
     """Each camera's delay against the others, and the gain of correcting it.
 
     Delays are in frames; with a positive delay the camera shows a later moment than the others at
@@ -202,17 +219,14 @@ def clock_errors(
         uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen.
         weight: ``[C, F, J]`` their confidence.
         max_lag: frames by which cameras are compared, either way.
-
-    Returns:
-        ``delay [C]``, NaN where it is unknown, and ``gain [C]``, the share by which the median
-        error falls.
     """
     C, F, _ = weight.shape
     delay = np.full(C, np.nan)
     gain = np.full(C, np.nan)
+    other = np.full(C, np.nan)
     reach = min(max_lag, F // 2)
     if reach < 1:
-        return delay, gain
+        return ClockErrors(delay, gain, other)
 
     # The rays of all detections, in the world.
     seen = is_known(uv) & (weight > 0)
@@ -233,21 +247,45 @@ def clock_errors(
             pairs.append((a, b))
             lags.append(found)
     if not pairs:
-        return delay, gain
+        return ClockErrors(delay, gain, other)
 
     # Delays whose differences are the lags of the pairs.
     delay = _delays(C, np.array(pairs), np.array([lag.best for lag in lags]))
+    changes = np.arange(-reach, reach + 1)
     for c in range(C):
+        # The error of the camera's pairs by how much its delay is changed.
         before = 0.0
-        after = 0.0
+        errors = np.zeros(len(changes))
         for (a, b), lag in zip(pairs, lags, strict=True):
             if c in (a, b) and np.isfinite(delay[a] - delay[b]):
-                step = int(np.clip(round(delay[a] - delay[b]), -reach, reach))
                 before += lag.errors[reach]
-                after += lag.errors[reach + step]
+                at = round(delay[a] - delay[b]) + changes * (
+                    1 if c == a else -1
+                )
+                inside = np.abs(at) <= reach
+                errors += np.where(
+                    inside, lag.errors[reach + at * inside], np.inf
+                )
         if before > 0:
-            gain[c] = 1 - after / before
-    return delay, gain
+            gain[c] = 1 - errors[reach] / before
+            minima = _other_minima(errors, reach, SIMILAR)
+            if len(minima):
+                lowest = errors[reach + minima].argmin()
+                other[c] = delay[c] + minima[lowest]
+    return ClockErrors(delay, gain, other)
+
+
+def _other_minima(errors: Float, best: int, similar: float) -> Ints:
+    """How far from the best place minima are that are at most ``similar`` times as high."""
+    # Between the places a parabola through three squares gives the height of a minimum.
+    squares = np.square(np.pad(errors, 1, constant_values=np.inf))
+    before, at, after = squares[:-2], squares[1:-1], squares[2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lower = (before - after) ** 2 / (8 * (before - 2 * at + after))
+    height = np.where(np.isfinite(lower), np.maximum(at - lower, 0), at)
+    lowest = (at <= before) & (at <= after) & np.isfinite(at)
+    places = np.flatnonzero(lowest & (height <= similar**2 * height[best]))
+    return places[np.abs(places - best) > APART] - best
 
 
 class _Lag(NamedTuple):
@@ -300,6 +338,10 @@ def _lag_of(a: Float, b: Float, baseline: Float, reach: int) -> _Lag | None:
         if len(values) >= MIN_MATCHES:
             errors[reach + lag] = np.median(values)
     best = int(errors.argmin()) - reach
+
+    # Where the motion repeats itself, all pairs of cameras must take the same of equal minima.
+    minima = best + _other_minima(errors, reach + best, EQUAL)
+    best = int(min(best, *minima, key=abs)) if len(minima) else best
 
     # At an end of the range the best lag may lie beyond it.
     if not np.isfinite(errors[reach]) or abs(best) == reach:
@@ -364,7 +406,7 @@ def unsteady_clocks(cameras: CameraArray, uv: Float, weight: Float) -> Float:
         weight: ``[C, F, J]`` their confidence.
     """
     # Without the delay of the whole recording, what remains is small.
-    whole, _ = clock_errors(cameras, uv, weight)
+    whole = clock_errors(cameras, uv, weight).delay
     delay = np.round(np.nan_to_num(whole)).astype(np.int64)
     third = weight.shape[1] // THIRDS
     parts: list[Float] = []
@@ -377,11 +419,11 @@ def unsteady_clocks(cameras: CameraArray, uv: Float, weight: Float) -> Float:
             shifted[c, inside] = np.where(
                 weight[c, at[inside], :, None] > 0, uv[c, at[inside]], np.nan
             )
-        lag, gain = clock_errors(
+        lag = clock_errors(
             cameras, shifted, np.ones(shifted.shape[:3]), DRIFT_LAG
         )
-        parts.append(lag)
-        gains.append(gain)
+        parts.append(lag.delay)
+        gains.append(lag.gain)
 
     # A change that matters in one of the parts.
     matters = np.nan_to_num(np.maximum(*gains)) > DRIFT_GAIN

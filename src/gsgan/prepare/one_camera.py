@@ -18,6 +18,7 @@ from gsgan.data.skeletons import usual_step
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import FILM, USUAL_FOCAL, CameraArray
 from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.clocks import ClockErrors
 from gsgan.prepare.frames import (
     MAX_SIDE,
     SAMPLING,
@@ -174,8 +175,7 @@ def solve_video(
         error=error,
         flips=np.zeros((1, F, len(FLIP_GROUPS) + 1), bool),
         left_out=np.zeros((1, F, 2), bool),
-        delay=np.full(1, np.nan),
-        gain=np.full(1, np.nan),
+        clocks=ClockErrors(*np.full((3, 1), np.nan)),
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
         frontier=(np.nan, np.nan),

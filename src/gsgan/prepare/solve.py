@@ -14,7 +14,7 @@ from gsgan.prepare.camera_array import (
     refine_cameras,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.clocks import clock_errors
+from gsgan.prepare.clocks import ClockErrors, clock_errors
 from gsgan.prepare.frontier import Outline, frontier_points
 from gsgan.prepare.many_views import Views, solve_views
 from gsgan.prepare.sides import (
@@ -156,8 +156,7 @@ class Solution:
     # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
     flips: Bool
     left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
-    delay: Float  # [C] of each camera's clock, see `clock_errors`
-    gain: Float  # [C] of correcting that clock
+    clocks: ClockErrors
     # name of each stage and its body errors [C, F, 33]
     stages: dict[str, Float]
     # median distance of silhouettes from epipolar lines, pixels: given cameras, refined ones
@@ -260,7 +259,7 @@ def solve(
 
     # Clocks by the cameras that silhouettes have chosen: wrong ones look like late clocks.
     chosen = CameraArray(given.K, cameras.R, cameras.t)
-    delay, gain = clock_errors(
+    clocks = clock_errors(
         chosen,
         uv[:, :, :BODY],
         np.where(conf > settings.min_confidence, conf, 0.0)[:, :, :BODY],
@@ -273,8 +272,7 @@ def solve(
         error=error * to_pixels,
         flips=corrected.flips,
         left_out=corrected.left_out,
-        delay=delay,
-        gain=gain,
+        clocks=clocks,
         stages=stages_in_pixels,
         removed=removed,
         frontier=refined.frontier,

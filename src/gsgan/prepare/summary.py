@@ -46,7 +46,7 @@ def summarise(outcome: Outcome) -> dict[str, Any]:
             "hands_px": median(error[:, HANDS]),
             "hands_swapped": int(solution.swapped_hands[c].sum()),
             "face_px": median(error[:, FACE]),
-            "delay_frames": float(solution.delay[c]),
+            "delay_frames": float(solution.clocks.delay[c]),
             "frames_with_person": int(np.isfinite(error).any(-1).sum()),
             "frames_written": len(outcome.written[name]),
         }
@@ -115,22 +115,31 @@ class LateClocks(NamedTuple):
 def late_clocks(outcome: Outcome) -> LateClocks:
     """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
     # Delays are counted in the chosen frames, of which only every n-th may be there.
-    solution = outcome.solution
     step = usual_step(outcome.frames)
     offsets = dict(outcome.options.offsets or {})
     late = []
     wrong = False
-    for name, delay, gain in zip(
-        outcome.inputs.sources, solution.delay, solution.gain, strict=True
+    repeated = False
+    for name, delay, gain, other in zip(
+        outcome.inputs.sources, *outcome.solution.clocks, strict=True
     ):
         if abs(delay) > DELAY and gain > DELAY_GAIN:
-            late.append(f"{name} {step * delay:+.1f}")
+            text = f"{name} {step * delay:+.1f}"
+            if np.isfinite(other):
+                repeated = True
+                text += f" or {step * other:+.1f}"
+            late.append(text)
             wrong = wrong or abs(delay) > LATE
             offsets[name] = offsets.get(name, 0) + round(step * delay)
     if not late:
         return LateClocks([], False)
     text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
     note = f"clocks seem late, in frames: {', '.join(late)}; set offsets={{{text}}}"
+    if repeated:
+        note += (
+            ", if a single event such as a clap agrees: the motion repeats itself, and another "
+            "delay fits nearly as well"
+        )
     return LateClocks([note], wrong)
 
 
