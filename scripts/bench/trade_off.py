@@ -43,7 +43,7 @@ from gsgan.run.runs import avatar_settings, load_avatar
 from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
-from gsgan.utils.checks import above, between, one_of
+from gsgan.utils.checks import between, one_of, positive
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.weights.networks import Lpips
 
@@ -182,7 +182,7 @@ def run(config: DictConfig, folder: Path) -> None:
         DataError: when a run or its data cannot be read.
     """
     common.check_whole(config, repeats=1, images=1)
-    above("patience", config.patience)
+    positive("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
     bench = bench_common.Bench.start("trade_off", config, folder)

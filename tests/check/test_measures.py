@@ -37,7 +37,7 @@ def test_joints_below_the_image_are_not_outside_its_mask(copy):
     subject = subject_of(GsganData(root=str(copy)))
     views = measure(subject, [("cam00", 3)], SAMPLING)[0]
     assert np.isnan(views[0].outside[25:]).all()
-    assert views[0].known.sum() > 12
+    assert views[0].has_joint.sum() > 12
 
 
 def test_joints_far_from_their_detections_are_named(copy):

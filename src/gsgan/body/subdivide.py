@@ -77,9 +77,9 @@ def _split(faces: Ints, middles: Ints) -> Ints:
     parts = [faces[number == 0]]
 
     # All three edges: a triangle at each corner, and one between the middles.
-    own = number == 3
-    a, b, c = faces[own].T
-    ab, bc, ca = middles[own].T
+    whole = number == 3
+    a, b, c = faces[whole].T
+    ab, bc, ca = middles[whole].T
     for triangle in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
         parts.append(np.stack(triangle, axis=1))
 

@@ -5,7 +5,7 @@ Thresholds that a reader applies as well are those of `gsgan.data.formats.consis
 
 from dataclasses import dataclass
 
-from gsgan.utils.checks import above
+from gsgan.utils.checks import positive
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Sampling:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            above(f"sampling.{name}", value)
+            positive(f"sampling.{name}", value)
 
 
 @dataclass(frozen=True)
@@ -52,4 +52,4 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            above(f"limits.{name}", value)
+            positive(f"limits.{name}", value)

@@ -11,7 +11,7 @@ from gsgan.render.run import RenderOptions, render
 from gsgan.run.drive import MotionOptions, drive_of
 from gsgan.run.runs import Run
 from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.config import CommandOptions, with_defaults
 from gsgan.utils.console import make_console
 from gsgan.utils.files import write_atomically, writing
@@ -39,7 +39,7 @@ def demo(options: DemoOptions) -> None:
     """
     # Without an encoder the video is a folder of PNG files.
     out = Path(options.out).expanduser()
-    pixels = whole("pixels", options.pixels, 16)
+    pixels = integer("pixels", options.pixels, 16)
     video = out / ("dance.mp4" if find_spec("av") else "dance")
     given = {
         "run": str(DEMO_FOLDER),

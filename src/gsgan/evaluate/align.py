@@ -83,5 +83,5 @@ def _difference(rendering: Rendering, frame: Frame) -> Tensor:
     alpha = rendering.splat_alpha
     assert colour is not None
     assert alpha is not None
-    absolute = partial(photometric, l1=1.0, ssim=0.0, unsure=frame.unsure)
+    absolute = partial(photometric, l1=1.0, ssim=0.0, ignored=frame.ignored)
     return absolute(colour, frame.image) + absolute(alpha, frame.mask)

@@ -46,7 +46,7 @@ from gsgan.evaluate.scores import (
     SplitScores,
     Tally,
     empty,
-    painter,
+    make_predictor,
     score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
@@ -71,7 +71,7 @@ from gsgan.run.stored import (
 from gsgan.scene import Frame
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track, working
 from gsgan.utils.errors import ConfigError
@@ -262,7 +262,7 @@ def evaluate_folder(
         score,
         console,
         data,
-        predict=painter(
+        predict=make_predictor(
             avatar.to(device), solve=solve, colours=not other, align=align
         ),
         method=method,
@@ -524,7 +524,7 @@ def _join_splits(
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
-    filled = [found.variants for found in scores.values() if found.variants]
+    filled = [split.variants for split in scores.values() if split.variants]
     variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_VARIANT)
 
     # metrics.json by split, scores.csv by image.
@@ -571,7 +571,7 @@ def make_scorer(
 
     # Some images of each split alone.
     if options.score_images is not None:
-        maximum = whole("score_images", options.score_images, 1)
+        maximum = integer("score_images", options.score_images, 1)
         marks.append(
             f"at most {maximum} images of each split, spread over its frames first"
         )

@@ -264,9 +264,9 @@ def hands_and_mouth(
     # Each hand's landmarks follow its wrist.
     hands = []
     for wrist, *_ in template.palms:
-        own = slice(wrist, wrist + HAND)
+        hand = slice(wrist, wrist + HAND)
         box = landmark_box(
-            pixels[:, own], seen[:, own], camera.size, HAND_MARGIN
+            pixels[:, hand], seen[:, hand], camera.size, HAND_MARGIN
         )
         hands.append(box)
 
@@ -283,9 +283,9 @@ def hands_and_mouth(
         )
     else:
         around = mouth_square(frame.skeleton[:, corners], camera)
-        known = seen[:, corners].all(dim=1, keepdim=True)
-        known = known.expand(-1, around.shape[1])
-        mouth = landmark_box(around, known, camera.size, 0.0)
+        mouth_seen = seen[:, corners].all(dim=1, keepdim=True)
+        mouth_seen = mouth_seen.expand(-1, around.shape[1])
+        mouth = landmark_box(around, mouth_seen, camera.size, 0.0)
 
     # A face turned to the camera has its mouth nearer than its ears.
     distance = camera.to_camera(frame.skeleton).norm(dim=-1)

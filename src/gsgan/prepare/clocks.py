@@ -226,12 +226,12 @@ def clock_errors(
     pairs = []
     lags = []
     for a, b in _pairs(C):
-        found = _lag_of(
+        pair_lag = _lag_of(
             rays[a], rays[b], cameras.centres[b] - cameras.centres[a], reach
         )
-        if found is not None:
+        if pair_lag is not None:
             pairs.append((a, b))
-            lags.append(found)
+            lags.append(pair_lag)
     if not pairs:
         return delay, gain
 

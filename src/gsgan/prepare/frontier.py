@@ -51,10 +51,10 @@ def find_outlines(
     """
     result = []
     for camera in cameras:
-        known = alphas[camera.name]
+        by_number = alphas[camera.name]
         outlines: list[Outline | None] = []
         for number in numbers[camera.name].tolist():
-            alpha = known.get(number)
+            alpha = by_number.get(number)
             outlines.append(None if alpha is None else _outline(camera, alpha))
         result.append(outlines)
     return result

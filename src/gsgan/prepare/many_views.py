@@ -86,8 +86,8 @@ def solve_views(views: Views) -> Tensor:
         at = rows[first : first + PART]
         whole = ViewsProblem(views[at], shape=False, smooth=True)
         start = replace(whole.start(), shared=state.shared)
-        found, _ = whole.minimise(start, POSE_STEPS)
-        X = whole.landmarks(found, whole.solver(found.shared))
+        solution, _ = whole.minimise(start, POSE_STEPS)
+        X = whole.landmarks(solution, whole.solver(solution.shared))
         new = p[at].isnan().all(-1).all(-1)
         new |= torch.arange(len(at)) >= SHARED // 2
         p[at[new]] = X[new]

@@ -24,7 +24,7 @@ from gsgan.prepare.sources import (
     upright,
 )
 from gsgan.skeleton.proportions import UP_AXES
-from gsgan.utils.checks import above, between, one_of, whole
+from gsgan.utils.checks import between, integer, one_of, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -103,12 +103,12 @@ class Options(CommandOptions):
             )
         for name in ("fps", "focal"):
             if getattr(self, name) is not None:
-                above(name, getattr(self, name))
+                positive(name, getattr(self, name))
         if self.height is not None:
             between("height", self.height, *PERSON_HEIGHTS)
-        above("landmark_noise", self.landmark_noise)
-        whole("workers", self.workers, 1)
-        above("scale", between("scale", self.scale, 0, 1))
+        positive("landmark_noise", self.landmark_noise)
+        integer("workers", self.workers, 1)
+        positive("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
         levels = self.mask_levels
         if len(levels) != 2 or not 0 <= levels[0] < levels[1] <= 1:

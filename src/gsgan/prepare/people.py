@@ -114,27 +114,27 @@ def find_crowds(
     return several
 
 
-def _only(found: Detections, chosen: Mapping[int, int]) -> Detections:
+def _only(detections: Detections, chosen: Mapping[int, int]) -> Detections:
     """Detections with the person of a number, -1 for nobody, in each row that is listed."""
-    px = found.px.copy()
-    conf = found.conf.copy()
+    px = detections.px.copy()
+    conf = detections.conf.copy()
     for row, person in chosen.items():
         if person < 0:
             px[row] = np.nan
             conf[row] = 0.0
-        elif found.people is not None:
-            px[row], conf[row] = found.people[row][person]
-    return replace(found, px=px, conf=conf, people=None)
+        elif detections.people is not None:
+            px[row], conf[row] = detections.people[row][person]
+    return replace(detections, px=px, conf=conf, people=None)
 
 
 def _people(
-    camera: CameraEntry, found: Detections, row: int | None
+    camera: CameraEntry, detections: Detections, row: int | None
 ) -> list[tuple[Float, Float]]:
     """Undistorted pixels ``[33, 2]`` and confidence ``[33]`` of each person in a frame."""
     if row is None:
         return []
-    alone = [(found.px[row], found.conf[row])]
-    people = alone if found.people is None else found.people[row]
+    alone = [(detections.px[row], detections.conf[row])]
+    people = alone if detections.people is None else detections.people[row]
     result = []
     for px, conf in people:
         seen = is_known(px[:BODY]) & (conf[:BODY] > 0)
@@ -148,17 +148,17 @@ def _groups(
 ) -> list[_Group]:
     """The people of one frame, each with its number in every camera that shows it."""
     # Every two detections of two cameras may be the same person.
-    found: dict[tuple[int, ...], _Group] = {}
+    by_rows: dict[tuple[int, ...], _Group] = {}
     for a, b in combinations(range(len(people)), 2):
         for i in range(len(people[a])):
             for j in range(len(people[b])):
                 group = _group(rig, people, {a: i, b: j})
                 if group is not None:
-                    found[group.chosen] = group
+                    by_rows[group.chosen] = group
 
     # Groups with most confidence first; a detection belongs to one person.
     groups: list[_Group] = []
-    for group in sorted(found.values(), key=lambda one: -one.confidence):
+    for group in sorted(by_rows.values(), key=lambda one: -one.confidence):
         taken = False
         for other in groups:
             for mine, theirs in zip(group.chosen, other.chosen, strict=True):

@@ -98,7 +98,7 @@ def read_character(path: Path) -> Character:
             f"{path}: no such file; expected a rigged character as .glb"
         )
     try:
-        glb = GltfFile(path, known=KNOWN)
+        glb = GltfFile(path, extensions=KNOWN)
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__

@@ -15,7 +15,7 @@ from gsgan.losses.adversarial import (
     generator_loss,
 )
 from gsgan.losses.perceptual import Perceptual, crop_person
-from gsgan.losses.photometric import photometric, without_unsure
+from gsgan.losses.photometric import photometric, without_ignored
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
@@ -71,7 +71,10 @@ class StepOneLoss:
             # Step I's colour.
             pixels = {"l1": self.l1, "ssim": self.ssim}
             loss = photometric(
-                rendering.colour + behind, target, unsure=frame.unsure, **pixels
+                rendering.colour + behind,
+                target,
+                ignored=frame.ignored,
+                **pixels,
             )
             if head is not None:
                 assert head.bias is not None
@@ -85,7 +88,7 @@ class StepOneLoss:
                 )
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
-                    read + behind, target, unsure=frame.unsure, **pixels
+                    read + behind, target, ignored=frame.ignored, **pixels
                 )
 
             # Alpha has the mask as its target where no background supervises it.
@@ -95,7 +98,7 @@ class StepOneLoss:
                     frame.mask,
                     l1=1.0,
                     ssim=0.0,
-                    unsure=frame.unsure,
+                    ignored=frame.ignored,
                 )
                 loss = loss + self.alpha * matte
             return loss
@@ -106,7 +109,7 @@ def perceptual_distance(
 ) -> Tensor:
     """L_perc of an image ``[B, 3, H, W]`` of a frame, or of crops that ``draws`` place."""
     # Unsure pixels of the target show the image itself.
-    target = without_unsure(frame.image, image, frame.unsure)
+    target = without_ignored(frame.image, image, frame.ignored)
     compared = [image, target]
 
     # Slow networks compare squares of the person alone.
@@ -242,7 +245,7 @@ class StepTwoLoss:
         """The discriminator's maps of a rendering of ``frame``."""
         # Unsure pixels show the image itself in the target.
         assert rendering.image is not None
-        target = without_unsure(frame.image, rendering.image, frame.unsure)
+        target = without_ignored(frame.image, rendering.image, frame.ignored)
         return DiscriminatorMaps(
             discriminator, rendering.image, target, self.gan
         )
@@ -278,7 +281,7 @@ class StepTwoLoss:
         image = rendering.image
         alpha = rendering.alpha
         assert image is not None and alpha is not None  # noqa: PT018
-        target = without_unsure(frame.image, image, frame.unsure)
+        target = without_ignored(frame.image, image, frame.ignored)
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
         terms = {"photometric": by_pixel(image, target)}
 
@@ -287,7 +290,7 @@ class StepTwoLoss:
             white = image + 1 - alpha
             truth = frame.image + 1 - frame.mask
             terms["alpha"] = self.alpha * by_pixel(
-                white, truth, unsure=frame.unsure
+                white, truth, ignored=frame.ignored
             )
 
         # L_Ψ and L_perc, which is weighted as much more as it is computed less often.

@@ -35,7 +35,7 @@ from gsgan.train.optimisers import (
 from gsgan.train.registration import Registered, Registration
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import at_least, integer, positive
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.tensors import full_precision
 
@@ -152,9 +152,9 @@ class AvatarTraining(LightningModule):
         self.pose_noise = settings.pose_noise
         self.window = settings.window
         if self.window is not None:
-            whole("training.window", self.window, 16)
+            integer("training.window", self.window, 16)
         reach = settings.window_reach
-        self.window_reach = above("training.window_reach", reach)
+        self.window_reach = positive("training.window_reach", reach)
         self.seed = settings.seed
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on

@@ -32,7 +32,7 @@ from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton.training_poses import pose_in_pelvis
 from gsgan.splat import rasterise
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import at_least, integer, positive
 from gsgan.utils.console import progress
 from gsgan.utils.records import TensorRecord
 
@@ -111,10 +111,10 @@ class Registration:
     small: float = 0.0006
 
     def __post_init__(self) -> None:
-        whole("training.registration.frames", self.frames, 2)
-        whole("training.registration.cameras", self.cameras, 1)
+        integer("training.registration.frames", self.frames, 2)
+        integer("training.registration.cameras", self.cameras, 1)
         at_least("training.registration.smooth", self.smooth, 0)
-        above("training.registration.small", self.small)
+        positive("training.registration.small", self.small)
 
     def __call__(
         self, avatar: Avatar, dataset: CaptureDataset, console: Console
@@ -199,7 +199,7 @@ class Drawn(NamedTuple):
     depth."""
 
     colours: Float
-    known: Float
+    has_colour: Float
     depth: Float
 
 
@@ -249,8 +249,8 @@ class MovingSurface:
         rows = np.arange(near[:, 1:].size)
         ones = np.ones(len(rows))
         shape = (len(rows), self.count)
-        own = np.repeat(np.arange(self.count), count - 1)
-        apart = sparse.csr_matrix((ones, (rows, own)), shape)
+        owner = np.repeat(np.arange(self.count), count - 1)
+        apart = sparse.csr_matrix((ones, (rows, owner)), shape)
         apart -= sparse.csr_matrix((ones, (rows, near[:, 1:].ravel())), shape)
 
         # The same for each axis.
@@ -281,8 +281,8 @@ class MovingSurface:
 
         # The mask, less its outline and pixels whose mask is not sure.
         inside = (item.mask[0, 0] > 0.9).float()
-        if item.unsure is not None:
-            inside = inside * (1 - item.unsure[0, 0])
+        if item.ignored is not None:
+            inside = inside * (1 - item.ignored[0, 0])
         size = 2 * OUTLINE + 1
         kernel = np.ones((size, size), np.uint8)
         shrunk = cv2.erode(inside.numpy(), kernel)
@@ -428,7 +428,7 @@ class MovingSurface:
     def _draw(
         self, view: TrainingView, means: Tensor, texture: Texture
     ) -> Drawn:
-        known = (texture.weights > 0.02).float().unsqueeze(1)
+        has_colour = (texture.weights > 0.02).float().unsqueeze(1)
         depth = view.camera.project(means.unsqueeze(0))[1][0].unsqueeze(1)
         count = len(means)
         scales = (PAINT_SIGMA * self.placed.points.spacing).unsqueeze(1)
@@ -440,7 +440,7 @@ class MovingSurface:
                 scales=scales.expand(1, count, 3),
                 opacities=torch.full((1, count), PAINT_OPACITY),
                 features=torch.cat(
-                    [texture.colours * known, known, depth], dim=1
+                    [texture.colours * has_colour, has_colour, depth], dim=1
                 ).unsqueeze(0),
             ),
             view.camera,
@@ -453,7 +453,7 @@ class MovingSurface:
         share = blended[..., 3:4]
         return Drawn(
             colours=blended[..., :3] / np.maximum(share, 1e-3),
-            known=(share[..., 0] > 0.6).astype(np.float32),
+            has_colour=(share[..., 0] > 0.6).astype(np.float32),
             depth=blended[..., 4] / np.maximum(alpha, 1e-3),
         )
 
@@ -482,9 +482,9 @@ class MovingSurface:
 
 def average(textures: Iterable[Texture]) -> Texture:
     """The average of textures, each point's colours by their weights."""
-    known = list(textures)
-    weights = torch.stack([texture.weights for texture in known])
-    colours = torch.stack([texture.colours for texture in known])
+    parts = list(textures)
+    weights = torch.stack([texture.weights for texture in parts])
+    colours = torch.stack([texture.colours for texture in parts])
     total = weights.sum(0)
     mean = (colours * weights.unsqueeze(2)).sum(0)
     return Texture(mean / total.clamp_min(1e-6)[:, None], total)
@@ -492,10 +492,10 @@ def average(textures: Iterable[Texture]) -> Texture:
 
 def fill_unknown(texture: Texture, other: Texture) -> Texture:
     """A texture, and another one where its colours are not known."""
-    known = texture.weights > 0.05
+    has_colour = texture.weights > 0.05
     return Texture(
-        torch.where(known[:, None], texture.colours, other.colours),
-        torch.where(known, texture.weights, other.weights),
+        torch.where(has_colour[:, None], texture.colours, other.colours),
+        torch.where(has_colour, texture.weights, other.weights),
     )
 
 
@@ -505,7 +505,7 @@ def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
     Source: OpenCV's dense inverse search (Kroeger et al., 2016).
     """
     # Where nothing is drawn or nobody is, both images are alike and nothing flows.
-    certain = (drawn.known * (view.inside > 0))[..., None] > 0
+    certain = (drawn.has_colour * (view.inside > 0))[..., None] > 0
     image = np.where(certain, drawn.colours, view.image)
     a = grey(image)
     b = grey(view.image)
@@ -527,7 +527,7 @@ def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
     )
     astray = np.square(forth + returned).sum(-1)
     trust = np.exp(-astray / ROUND_TRIP**2) * texture(b)
-    return forth, trust * view.inside * drawn.known
+    return forth, trust * view.inside * drawn.has_colour
 
 
 def project_points(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsgan.utils.checks import between, whole
+from gsgan.utils.checks import between, integer
 
 # mean of an image whose ground truth is within 0 and 1: beyond it Ψ has exploded
 BRIGHTEST = 10.0
@@ -44,7 +44,7 @@ class Rollback:
         between("training.rollback.collapse", self.collapse, 0, self.healthy)
         between("training.rollback.memory", self.memory, 0, 1)
         between("training.rollback.slower", self.slower, 0, 1)
-        whole("training.rollback.max_restorations", self.max_restorations, 0)
+        integer("training.rollback.max_restorations", self.max_restorations, 0)
 
     @property
     def rate(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from gsgan.utils.checks import above, at_least, between, one_of
+from gsgan.utils.checks import at_least, between, one_of, positive
 from gsgan.utils.errors import ConfigError
 
 SEGMENTATION = "segmentation"
@@ -43,7 +43,7 @@ class Schedule:
 
     def __post_init__(self) -> None:
         # No length may be negative, and the run needs at least one iteration.
-        above("training.schedule.stretch", self.stretch)
+        positive("training.schedule.stretch", self.stretch)
         for name in ("segmentation", *STRETCHED_STEPS):
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
         at_least("training.schedule.epoch", self.epoch, 1)
