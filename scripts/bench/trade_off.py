@@ -31,7 +31,6 @@ from gsgan.bench.speed import (
     deciles,
     make_painter,
     place,
-    set_backend,
     spread,
     without_denormals,
 )
@@ -128,7 +127,7 @@ class Painter:
             )
             frame = replace(frame, camera=frame.camera.resize(side))
         with changed(self.avatar, way):
-            image = make_painter(self.avatar, way.precision, way.backend)(frame)
+            image = make_painter(self.avatar, way.precision)(frame)
         if way.scale == 1:
             return image
         return functional.interpolate(
@@ -140,9 +139,18 @@ class Painter:
         )
 
 
+def set_backend(avatar: Avatar, backend: str) -> None:
+    """Selects the rasteriser of F and S."""
+    # S is drawn by a part of its own.
+    avatar.backend = backend
+    if avatar.segmentation is not None:
+        avatar.segmentation.backend = backend
+
+
 @contextmanager
 def changed(avatar: Avatar, way: Way) -> Iterator[None]:
-    """Gives the avatar the accuracy and window of a way, and restores its own afterwards."""
+    """Gives the avatar the accuracy, rasteriser and window of a way, and restores its own
+    afterwards."""
     before = avatar.accuracy, avatar.window_margin, avatar.generator_margin
     # how pixels are formed belongs to the model, not to the preset
     if way.accuracy is not None:
@@ -151,6 +159,7 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
             for k in ("low_pass", "supersample", "antialias")
         }
         avatar.accuracy = replace(way.accuracy, **formed)
+    set_backend(avatar, way.backend)
     if way.whole:
         avatar.window_margin = avatar.generator_margin = None
     try:

@@ -163,7 +163,9 @@ def test_what_is_written_is_read(fitted, people, compose):
 def test_scores_say_that_held_out_frames_were_registered(
     fitted, fit, people, compose, tmp_path
 ):
-    options = ScoreOptions(lpips={"nets": [], "path": None})
+    options = ScoreOptions(
+        lpips={"nets": [], "path": None}, score_images=None, grid_rows=4
+    )
     assert not any(
         "fitted" in mark
         for mark in make_scorer(options, GsganData(str(fitted)), []).marks

@@ -92,10 +92,11 @@ class ScoreOptions(CommandOptions):
     """
 
     lpips: Mapping[str, Any]
+    score_images: int | None
+    grid_rows: int
+    # gsgan.train has neither: all splits are scored, on the protocol's background
     background: str | None = None
     splits: Sequence[str] = HELD_OUT_SPLITS
-    score_images: int | None = None
-    grid_rows: int = 4
 
     @property
     def lpips_nets(self) -> Sequence[str]:

@@ -125,14 +125,14 @@ def misfits(error: Float) -> Bool:
 class SolveSettings:
     """Settings of the solution, see conf/prepare.yaml."""
 
-    min_confidence: float = 0.1  # of a detection
-    refinements: int = 3  # number of rounds
-    rotation_prior: float = 2.0  # standard deviation, degrees
-    position_prior: float = 0.05  # standard deviation, metres
-    smoothing: float = 0.02  # seconds
-    body: bool = True  # joints are those of one body in smooth motion
+    min_confidence: float  # of a detection
+    refinements: int  # number of rounds
+    rotation_prior: float  # standard deviation, degrees
+    position_prior: float  # standard deviation, metres
+    smoothing: float  # seconds
+    body: bool  # joints are those of one body in smooth motion
     # standard deviation of a landmark, thousandths of the focal length
-    noise: float = 2.0
+    noise: float
 
     def __post_init__(self) -> None:
         integer("solve.refinements", self.refinements, 0)

@@ -29,7 +29,7 @@ class StepOneLoss:
 
     Args:
         l1, ssim: weights (paper: 0.8, 0.2).
-        feature_head, alpha, perceptual: weights, see conf/training/long.yaml; 0 builds no readout
+        feature_head, alpha, perceptual: weights, see conf/training/_base.yaml; 0 builds no readout
             of F, and no perceptual network for Step I.
         perceptual_from: share of Step I without the perceptual loss.
 
@@ -214,7 +214,7 @@ class _Through(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class StepTwoLoss:
-    """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
+    """Weights of the generator's loss (conf/training/_base.yaml); 0 computes no term.
 
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat.
     """

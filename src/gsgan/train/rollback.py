@@ -27,14 +27,14 @@ class Rollback:
     All values are averaged over recent iterations, so that a fall within an epoch is
     seen. Optimisers restart after a restoration, because their momenta point into the collapse.
 
-    Settings: conf/training/long.yaml.
+    Settings: conf/training/_base.yaml.
     """
 
-    collapse: float = 0.05
-    healthy: float = 0.5
-    memory: float = 0.9
-    max_restorations: int = 3
-    slower: float = 0.5
+    collapse: float
+    healthy: float
+    memory: float
+    max_restorations: int
+    slower: float
     done: int = 0
     means: dict[str, Tensor] = field(default_factory=dict)
     _state: dict[str, Any] | None = field(default=None, repr=False)

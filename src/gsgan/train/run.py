@@ -249,7 +249,7 @@ def _prepare_avatar(
     if distil is not None:
         start_from(module.avatar, data, Path(distil).expanduser())
     elif module.avatar.effects.registration.on:
-        module.registered = module.registration(
+        module.surface_offsets = module.registration(
             module.avatar, data.dataset("train"), console
         )
 
