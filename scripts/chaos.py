@@ -38,10 +38,11 @@ from typing import Any
 
 # also because a process with threads cannot be forked
 os.environ["OMP_NUM_THREADS"] = "1"
-for part in ("", "data", "prepare"):
-    sys.path.insert(
-        0, str(Path(__file__).resolve().parents[1] / "tests" / part)
-    )
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "data"))
+sys.path.insert(
+    0, str(Path(__file__).resolve().parents[1] / "tests" / "prepare")
+)
 
 import gsgan.utils.compat  # noqa: F401  (before lightning)
 

@@ -171,7 +171,7 @@ class Solver(nn.Module):
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
                 "replaced": replaced,
-                "has_place": has_place,
+                "has_place": body.landmarks.isfinite().all(-1),
             }
             for name, value in vars(rig).items():
                 if isinstance(value, Tensor):
