@@ -34,7 +34,10 @@ REGISTERED = (
     "model=splat_only",
     ON,
     "effects.registration=on",
+    "training.registration.frames=2",
+    "training.registration.cameras=1",
 )
+SETTINGS = registration_settings()
 SIZE = 192
 BENT = "upperarm01.L"
 
@@ -138,9 +141,7 @@ def avatar_of(placed) -> SimpleNamespace:
 @pytest.fixture(scope="module")
 def found(painted):
     """The offsets of each frame, before any is explained by the pose."""
-    surface = MovingSurface(
-        avatar_of(painted.placed), painted, registration_settings()
-    )
+    surface = MovingSurface(avatar_of(painted.placed), painted, SETTINGS)
     return surface.align_frames(range(4), Console(quiet=True))
 
 
@@ -163,9 +164,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
         torch.stack([pose.theta[0] for pose in painted.poses]),
         torch.zeros_like(painted.offsets),
     )
-    surface = MovingSurface(
-        avatar_of(painted.placed), still, registration_settings()
-    )
+    surface = MovingSurface(avatar_of(painted.placed), still, SETTINGS)
     found = surface.align_frames(range(4), Console(quiet=True))
     # a third of a pixel
     assert found.norm(dim=2).median() < 0.0035
@@ -173,9 +172,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
 
 def test_what_the_pose_explains_starts_the_offsets(painted, found):
     placed = deepcopy(painted.placed)
-    registered = registration_settings()(
-        avatar_of(placed), painted, Console(quiet=True)
-    )
+    registered = SETTINGS(avatar_of(placed), painted, Console(quiet=True))
     with torch.no_grad():
         for frame, pose in enumerate(painted.poses):
             rest = registered.of(torch.tensor([frame]))
