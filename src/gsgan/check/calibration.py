@@ -20,7 +20,7 @@ from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED_IMAGES = "mirrored images"
-FULL = 0.98  # share of the image above which a mask is white everywhere
+FULL_MASK = 0.98  # share of the image above which a mask is white everywhere
 # Area of another piece of the mask over the person's, and share of a camera's images with one.
 OTHER_PIECE = 0.3
 OTHER_IMAGES = 0.1
@@ -262,7 +262,7 @@ def mask_findings(
 
     # White everywhere, or inverted.
     findings = []
-    full = [score.name for score in scores if score.filled > FULL]
+    full = [score.name for score in scores if score.filled > FULL_MASK]
     if full:
         text = f"masks are white everywhere ({list_names(full)}); {wrong}"
         findings.append(Finding("error", TOPIC, text))

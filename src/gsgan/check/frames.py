@@ -44,7 +44,7 @@ MAX_BACKWARDS = 0.5
 # The names of landmarks count as those of this many cameras.
 SURE_LABELS = 2.0
 USUAL_RATE = 30.0  # frames per second of a capture that does not state it
-PARTS = ("head", "arms", "legs")  # of `FLIP_GROUPS`
+DOUBTED_PARTS = ("head", "arms", "legs")  # of `FLIP_GROUPS`
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def frame_findings(
     # Left and right exchanged for a time: an error with the frames of each part.
     if not mirrored:
         wrong = find_exchanges(subject)
-        for part, flags in zip(PARTS, wrong.T, strict=True):
+        for part, flags in zip(DOUBTED_PARTS, wrong.T, strict=True):
             frames = subject.frames[flags].tolist()
             if frames:
                 text = (

@@ -13,7 +13,7 @@ from gsgan.data.skeletons import Landmarks
 from gsgan.data.validation import spans
 from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Ints, evenly_spaced
-from gsgan.utils.checks import integer
+from gsgan.utils.checks import AUTO, integer
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.frame_files import LARGEST_FRAME
 from gsgan.utils.tensors import farthest_points
@@ -33,7 +33,6 @@ SPLITS = ("train", "novel_view", "novel_pose")
 # a further split, of frames cut from the training frames, where it is asked for
 VALIDATION = "validation"
 # what cuts the last share of the training frames
-AUTO = "auto"
 VALIDATION_SHARE = 0.1
 # camera name, frame number
 Item = tuple[str, int]

@@ -16,7 +16,7 @@ from gsgan.utils.config import CommandOptions, with_defaults
 from gsgan.utils.console import make_console
 from gsgan.utils.files import write_atomically, writing
 
-FPS = 25  # of the dance
+DANCE_FPS = 25  # of the dance
 PICTURE = 14  # the frame that the picture shows
 
 
@@ -46,7 +46,7 @@ def demo(options: DemoOptions) -> None:
         "motion": str(DEMO_MOTION),
         "out": str(video),
         "overwrite": options.overwrite,
-        "fps": FPS,
+        "fps": DANCE_FPS,
         "frames": options.frames,
         "pixels": pixels,
         "background": "white",
@@ -56,7 +56,7 @@ def demo(options: DemoOptions) -> None:
     # The picture shows one pose of the dance from the front.
     run = Run.load(DEMO_FOLDER)
     motion = MotionOptions(motion=str(DEMO_MOTION))
-    drive = drive_of(motion, run, FPS)
+    drive = drive_of(motion, run, DANCE_FPS)
     picture = out / "picture.png"
     content = preview(run, drive.rows(np.array([PICTURE])), pixels)
     with writing(picture):

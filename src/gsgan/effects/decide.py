@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gsgan.effects.record import OFF, Effect, Effects
-from gsgan.utils.checks import is_number, one_of
+from gsgan.utils.checks import AUTO, is_number, one_of
 from gsgan.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo
 
-AUTO = "auto"
 ON_OFF = (AUTO, "on", "off")
 # Values that each effect may be set to.
 CHOICES: dict[str, tuple[str | int, ...]] = {

@@ -67,7 +67,8 @@ ENDINGS = {
     "motion_glb": ".glb",
     "hub": "",
 }
-MOTIONS = ("bvh", "motion_glb")  # formats that hold a motion and no avatar
+# formats that hold a motion and no avatar
+MOTION_FORMATS = ("bvh", "motion_glb")
 CARD = "MODEL_CARD.md"
 PREVIEW_SIZE = 512  # pixels, of runs whose images have sizes of their own
 
@@ -133,7 +134,7 @@ def export(options: ExportOptions) -> None:
     _check_upload(options, kind)
     if kind == "usd":
         refuse_missing_usd()
-    if kind in MOTIONS:
+    if kind in MOTION_FORMATS:
         motion = _motion(options, console)
         _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
         tell(
@@ -209,9 +210,10 @@ def _card_of(out: Path, sequence: bool) -> Path:
 def _place(options: ExportOptions, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
     # A capture has motion, but no avatar.
-    if options.capture is not None and kind not in MOTIONS:
+    if options.capture is not None and kind not in MOTION_FORMATS:
         raise ConfigError(
-            f"capture: format={kind} needs run=<folder>; a capture gives {', '.join(MOTIONS)}"
+            f"capture: format={kind} needs run=<folder>; a capture gives "
+            f"{', '.join(MOTION_FORMATS)}"
         )
 
     # The name must say the format: a file with its ending, or a folder for .ply files.

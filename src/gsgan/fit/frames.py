@@ -19,7 +19,7 @@ from gsgan.utils.errors import DataError
 # metres around the joints, as in the avatar's windows: a wider margin costs time
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
-USUAL = 0.75
+USUAL_QUANTILE = 0.75
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,9 @@ class MaskedFrames:
 
         # The usual area is that of masks with a person.
         positive = [area for area in areas if area > 0]
-        usual = float(np.quantile(positive, USUAL)) if positive else np.inf
+        usual = (
+            float(np.quantile(positive, USUAL_QUANTILE)) if positive else np.inf
+        )
         return [
             place for place, area in enumerate(areas) if area >= minimum * usual
         ]

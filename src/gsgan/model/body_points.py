@@ -25,7 +25,7 @@ from gsgan.model.interpolation import Interpolation
 from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
-from gsgan.utils.checks import at_least, integer, positive
+from gsgan.utils.checks import AUTO, at_least, integer, positive
 from gsgan.utils.tensors import derive, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
@@ -33,7 +33,6 @@ NORMAL_FLOOR = 1e-2
 # controls that correct a point; bones that it may follow
 NEAREST_CONTROLS = 4
 FOLLOWED_BONES = 6
-AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
 # Points per pixel of the person from which Step I's colour has scored as well as the generator's

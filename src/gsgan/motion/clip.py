@@ -38,7 +38,7 @@ FPS = 30.0  # assumed if neither the file nor the user gives a rate
 # Maximum relative difference of bone lengths at which a motion is the subject's own.
 OWN_LENGTHS = 0.02
 # A joint seen in a smaller share of the frames counts as a false detection.
-MIN_SEEN = 0.2
+MIN_BONE_SEEN = 0.2
 ROUNDED = 5e-4  # relative difference of a rate from a whole number
 JUST_BEYOND = 0.05  # share of a frame
 MAX_GAP = 5  # frames: in a longer gap a hand or face is not seen
@@ -181,8 +181,8 @@ def complete(motion: Clip, up: str) -> Float:
     """All landmarks ``[F, J, 3]`` in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
-    `MIN_SEEN` of the frames show takes its place in the rest pose, relative to its parent. Gaps of
-    a hand or the face of up to `MAX_GAP` frames are interpolated; in longer ones it is NaN.
+    `MIN_BONE_SEEN` of the frames show takes its place in the rest pose, relative to its parent.
+    Gaps of a hand or the face of up to `MAX_GAP` frames are interpolated; in longer ones it is NaN.
     """
     # Offsets of the body's joints from their parents are interpolated.
     whole = motion.p @ upright(up).T
@@ -194,7 +194,7 @@ def complete(motion: Clip, up: str) -> Float:
     for joint, parent in PARENT.items():
         offset = p[:, joint] - p[:, parent]
         seen = has_place[:, joint] & has_place[:, parent]
-        if seen.mean() < MIN_SEEN:
+        if seen.mean() < MIN_BONE_SEEN:
             has_place[:, joint] = False
         elif not seen.all():
             # In between, the bone turns from where it was to where it is seen

@@ -33,7 +33,7 @@ UNTOLD = (
     "its 25 joints were read as BODY_25, which cannot be told from BODY_25B: no frame shows neck "
     "and hips"
 )
-MAX_SHARE = (
+MAX_PEOPLE_SHARE = (
     2.0  # of the image's size: a cut-off body may reach beyond the image
 )
 MAX_PEOPLE = 5  # of a file, those with most confidence
@@ -109,7 +109,7 @@ def read_detections(path: Path) -> Detections:
 
     # Some detectors write shares of the image's size.
     seen = px[conf > 0]
-    if len(seen) and np.abs(seen).max() <= MAX_SHARE:
+    if len(seen) and np.abs(seen).max() <= MAX_PEOPLE_SHARE:
         raise DataError(
             f"{path}: all landmarks are between {seen.min():.2f} and {seen.max():.2f}; expected "
             "pixels of the image, not shares of its size"

@@ -26,7 +26,7 @@ MIN_BLOB = 0.02
 MIN_ROOM = 3  # images that show a pixel of the room: fewer do not tell it
 ROWS = 64  # rows of all images at once, which bounds the memory
 # Lengths as shares of the height of the person's box.
-PERSON_MARGIN = 0.025  # round the mask: the room is not taken from there
+ROOM_MARGIN = 0.025  # round the mask: the room is not taken from there
 BAND = 0.015  # half the width of the band round the outline in which alpha is estimated
 # Colours are from 0 to 255.
 EDGE = 2  # pixels beside the outline whose colours are compared
@@ -37,7 +37,9 @@ DARKEST_SHADOW = 0.4  # of the room's colour, in the person's shadow
 GUIDE_RADIUS = 2  # pixels of the guided filter
 GUIDE_NOISE = 6.0  # differences of colour below it are noise
 ROOM_NOISE = 8.0  # standard deviation of the room's colours
-UNSURE = 3.0  # evidence that a pixel like the room has against the person
+UNSURE_EVIDENCE = (
+    3.0  # evidence that a pixel like the room has against the person
+)
 MAX_CHANGE = (
     20.0  # median change of the room beside the person; more is another room
 )
@@ -103,7 +105,7 @@ def study_room(
             mask = tidy(read_mask_values(masks[number]), levels)
             images[number] = image
             tidied[number] = mask
-            reach = _disc(_pixels(mask, PERSON_MARGIN))
+            reach = _disc(_pixels(mask, ROOM_MARGIN))
             free.append(cv2.dilate(mask, reach) == 0)
 
     # The median of each pixel: values that do not count are sorted to the end.
@@ -171,7 +173,9 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
 
     # Whether each pixel is the person: the mask's evidence, and how unlike the room it is.
     behind = _shade_room(seen, empty, prior)
-    unlike = ((seen - behind) ** 2).sum(-1) / (2 * ROOM_NOISE**2) - UNSURE
+    unlike = ((seen - behind) ** 2).sum(-1) / (
+        2 * ROOM_NOISE**2
+    ) - UNSURE_EVIDENCE
     unlike = np.where(room_seen, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
     blurred = cv2.GaussianBlur(prior, (0, 0), reach / 2).clip(0.02, 0.98)
     evidence = np.log(blurred / (1 - blurred)) + unlike

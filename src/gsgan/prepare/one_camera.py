@@ -64,7 +64,9 @@ from gsgan.utils.pickles import read_arrays
 
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
-DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
+MAX_ERROR_RATIO = (
+    3.0  # a frame with this many times the usual error is left out
+)
 # The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background
 # that moves more, more images of several people, or fewer images of the feet.
 MIN_SECONDS = 8.0  # seconds
@@ -211,7 +213,7 @@ def doubtful_poses(errors: Float) -> Bool:
             without a seen landmark is not doubtful.
     """
     medians = nanmedian(errors, axis=1)
-    return medians > DOUBTFUL * nanmedian(medians, axis=0)
+    return medians > MAX_ERROR_RATIO * nanmedian(medians, axis=0)
 
 
 def _read(

@@ -19,7 +19,7 @@ from gsgan.utils.errors import DataError
 # Median reprojection error, thousandths of the focal length, above which two cameras show two
 # people: 15 cm at 3 m.
 SAME_PERSON = 50.0
-MIN_JOINTS = 6  # joints that a person has in common with another camera
+MIN_COMMON_JOINTS = 6  # joints that a person has in common with another camera
 # Steps from frame to frame, in sizes of the person: those of up to this many times the usual step,
 # and of at least this size, cost nothing.
 USUAL_STEPS = 3.0
@@ -180,7 +180,7 @@ def _group(
     for camera, person in pair.items():
         uv[camera], weight[camera] = people[camera][person]
     both = (weight > 0).sum(0) == len(pair)
-    if both.sum() < MIN_JOINTS:
+    if both.sum() < MIN_COMMON_JOINTS:
         return None
     scaled, pixels = rig.normalise(uv)
     p = plain(scaled, pixels, weight)
@@ -224,7 +224,7 @@ def _error(
     for joints in (p, p[list(MEDIAPIPE33.mirror)]):
         errors = scaled.errors(joints, pixels)[0]
         errors = errors[(conf > 0) & np.isfinite(errors)]
-        if len(errors) >= MIN_JOINTS:
+        if len(errors) >= MIN_COMMON_JOINTS:
             smallest = min(smallest, float(np.median(errors)))
     return smallest
 

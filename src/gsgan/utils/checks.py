@@ -8,6 +8,8 @@ from typing import Any
 
 from gsgan.utils.errors import ConfigError
 
+AUTO = "auto"  # the value of an option that the data decides
+
 
 def _require(holds: bool, name: str, expected: str, value: Any) -> None:
     if not holds:

@@ -40,7 +40,7 @@ ELSEWHERE = (
     "192.0.2.1",
     9,
 )  # an address for documentation, and the port that discards
-ORIGIN = r"https?://[^/\s]+/?"
+ORIGIN_PATTERN = r"https?://[^/\s]+/?"
 MAX_UPLOADS = 8  # of a browser at the same time
 
 
@@ -125,7 +125,7 @@ class Viewer:
 
         # The page's address behind a proxy.
         origin = None if options.origin is None else str(options.origin)
-        if origin is not None and not re.fullmatch(ORIGIN, origin):
+        if origin is not None and not re.fullmatch(ORIGIN_PATTERN, origin):
             raise ConfigError(
                 f"origin must be the beginning of an address, such as https://name, got {origin!r}"
             )
