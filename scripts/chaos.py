@@ -38,6 +38,7 @@ from typing import Any
 
 # also because a process with threads cannot be forked
 os.environ["OMP_NUM_THREADS"] = "1"
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "data"))
 sys.path.insert(
     0, str(Path(__file__).resolve().parents[1] / "tests" / "prepare")

@@ -1,8 +1,11 @@
 """What commands make of a config, for tests that compose one."""
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
 
 import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
 
@@ -56,3 +59,35 @@ def run_fit(config: DictConfig):
     from gsgan.fit import run
 
     return run.run_fit(run.FitOptions.from_config(config))
+
+
+def settings(file: str, section: str = "", **changes: Any) -> Any:
+    """What a file of conf/, or a section of it, builds with ``_target_``, with changed values."""
+    from gsgan.utils.config import build, config_folder
+
+    config = OmegaConf.load(config_folder() / f"{file}.yaml")
+    node = OmegaConf.select(config, section) if section else config
+    values = {
+        key: build(value) for key, value in node.items() if key != "_target_"
+    }
+    return get_class(node["_target_"])(**values | changes)
+
+
+effect_settings = partial(settings, "effects/auto")
+check_sampling = partial(settings, "check", "sampling")
+check_limits = partial(settings, "check", "limits")
+solve_settings = partial(settings, "prepare", "solve")
+mediapipe_tool = partial(settings, "prepare", "mediapipe")
+rollback_settings = partial(settings, "training/_base", "rollback")
+registration_settings = partial(settings, "training/_base", "registration")
+
+
+def prepare_options(**changes: Any) -> Any:
+    """The options of gsgan.prepare, with changed values."""
+    from gsgan.prepare.options import Options
+    from gsgan.utils.config import build, defaults_of
+
+    values = {
+        key: build(value) for key, value in defaults_of("prepare").items()
+    }
+    return Options(**values | changes)

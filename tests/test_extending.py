@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
 from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
-from gsgan.data.layout import Found, Meta
+from gsgan.data.layout import DatasetFiles, Meta
 from gsgan.data.skeletons import make_landmarks
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.rendering import Rendering
@@ -30,7 +30,7 @@ class NpzReader(FolderReader):
     contents = "cameras.npz, skeletons.npz, CAMERA/ and CAMERA_mask/"
     hint = "check that cameras.npz and skeletons.npz have the same world frame and unit"
 
-    def find(self, root, limits, smpl) -> Found:
+    def find(self, root, limits, smpl) -> DatasetFiles:
         images, masks, cameras = {}, {}, {}
         file = root / "cameras.npz"
         with np.load(file) as arrays:
@@ -45,7 +45,7 @@ class NpzReader(FolderReader):
                 )
         with np.load(root / "skeletons.npz") as arrays:
             p, ids = arrays["p"], arrays["frame"]
-        return Found(
+        return DatasetFiles(
             root=root,
             meta=Meta(layout="npz"),
             cameras=cameras,

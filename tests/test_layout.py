@@ -150,6 +150,97 @@ def test_no_public_class_name_is_defined_twice():
     assert not twice
 
 
+PARTICIPLES = frozenset(
+    [
+        "begun",
+        "bent",
+        "bound",
+        "bought",
+        "broken",
+        "brought",
+        "built",
+        "caught",
+        "chosen",
+        "drawn",
+        "driven",
+        "done",
+        "fallen",
+        "found",
+        "given",
+        "gone",
+        "grown",
+        "had",
+        "held",
+        "hidden",
+        "kept",
+        "known",
+        "laid",
+        "left",
+        "lent",
+        "lost",
+        "made",
+        "met",
+        "paid",
+        "said",
+        "seen",
+        "sent",
+        "shown",
+        "shrunk",
+        "swept",
+        "taken",
+        "thrown",
+        "told",
+        "torn",
+        "turned",
+        "won",
+        "worn",
+        "written",
+    ]
+)
+# verbs and nouns that end as participles do
+NO_PARTICIPLES = ("bed", "embed", "feed", "need", "seed", "shed", "speed")
+
+
+def is_participle(name: str) -> bool:
+    """Whether a function's first word is a participle."""
+    first = name.strip("_").lower().split("_")[0]
+    regular = first.endswith("ed") and first not in NO_PARTICIPLES
+    return regular or first in PARTICIPLES
+
+
+def test_functions_are_verbs():
+    """Properties are left out: their names say what something is."""
+    count = 0
+    participles = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            decorators = " ".join(map(ast.unparse, node.decorator_list))
+            if "property" in decorators or "overload" in decorators:
+                continue
+            count += 1
+            if is_participle(node.name):
+                participles.append(f"{module_name(path)}.{node.name}")
+    assert len(participles) <= 0.02 * count, participles
+
+
+def test_values_are_named_by_their_content():
+    """Not by how they came about: see the table of words in CONTRIBUTING.md."""
+    offenders = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                name = node.id
+            elif isinstance(node, ast.arg | ast.FunctionDef):
+                name = node.arg if isinstance(node, ast.arg) else node.name
+            else:
+                continue
+            if name in ("found", "known", "own"):
+                offenders.append(f"{module_name(path)}:{node.lineno} {name}")
+    assert not offenders
+
+
 def annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
     """The types of a function's arguments."""
     arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]

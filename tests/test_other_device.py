@@ -15,7 +15,7 @@ from other_device import Remote, other_device
 from gsgan.body import free_body
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import BodyBoxes, Preparation
-from gsgan.evaluate.scores import Scorer, Tally, painter
+from gsgan.evaluate.scores import Scorer, Tally, make_predictor
 from gsgan.fit.fitter import Fitter
 from gsgan.fit.frames import MaskedFrames
 from gsgan.model.harmonic import distil
@@ -72,7 +72,10 @@ def test_scores_there_are_those_of_here(build, monkeypatch, region):
         tally = Tally(Scorer(preparation))
         item = data.dataset("train").items[0]
         tally.add(
-            item, frame, painter(avatar, solve=True)(frame, item), show=True
+            item,
+            frame,
+            make_predictor(avatar, solve=True)(frame, item),
+            show=True,
         )
         return tally.result().rows["full"][0]
 

@@ -92,17 +92,17 @@ def test_the_boxs_camera_sees_the_same_point():
 
 
 def test_a_frame_seen_through_its_box_is_cut_in_every_map():
-    """With ``unsure`` left whole, the loss would compare pictures of two sizes."""
+    """With ``ignored`` left whole, the loss would compare pictures of two sizes."""
     pixels = torch.arange(HEIGHT * WIDTH, dtype=torch.float32).view(
         1, 1, HEIGHT, WIDTH
     )
     labels = pixels[:, 0].long()
     frame = frame_of(
-        pixels.expand(1, 3, -1, -1), pixels, labels=labels, unsure=pixels
+        pixels.expand(1, 3, -1, -1), pixels, labels=labels, ignored=pixels
     )
     seen = window([[[-0.2, -0.2, 2.0], [0.2, 0.2, 2.0]]]).frame(frame)
     cut = pixels[..., 22:38, 42:58]
-    assert torch.equal(seen.unsure, cut)
+    assert torch.equal(seen.ignored, cut)
     assert torch.equal(seen.mask, cut)
     assert torch.equal(seen.image, cut.expand(1, 3, -1, -1))
     assert torch.equal(seen.labels, cut[:, 0].long())

@@ -23,9 +23,9 @@ import numpy as np
 
 from gsgan.check.report import Finding
 from gsgan.check.run import check_data
-from gsgan.check.settings import Limits, Sampling
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import CaptureReader
+from gsgan.utils.config import build, defaults_of
 
 IMAGES = 80
 LEVELS = ("error", "warning")
@@ -179,7 +179,13 @@ def damaged(
 def findings(root: Path) -> tuple[Finding, ...] | None:
     """What the check finds; None when the dataset cannot be read."""
     data = GsganData(root=str(root), reader=CaptureReader())
-    report = check_data(data, Sampling(images=IMAGES), Limits())
+    defaults = defaults_of("check")
+    report = check_data(
+        data,
+        build(defaults.sampling, images=IMAGES),
+        build(defaults.limits),
+        build(defaults_of("effects/auto")),
+    )
     return report.findings if report.numbers.get("readable", True) else None
 
 

@@ -31,7 +31,6 @@ from gsgan.bench.speed import (
     deciles,
     make_painter,
     place,
-    set_backend,
     spread,
     without_denormals,
 )
@@ -43,7 +42,7 @@ from gsgan.run.runs import avatar_settings, load_avatar
 from gsgan.run.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
-from gsgan.utils.checks import above, between, one_of
+from gsgan.utils.checks import between, one_of, positive
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.weights.networks import Lpips
 
@@ -128,7 +127,7 @@ class Painter:
             )
             frame = replace(frame, camera=frame.camera.resize(side))
         with changed(self.avatar, way):
-            image = make_painter(self.avatar, way.precision, way.backend)(frame)
+            image = make_painter(self.avatar, way.precision)(frame)
         if way.scale == 1:
             return image
         return functional.interpolate(
@@ -140,9 +139,18 @@ class Painter:
         )
 
 
+def set_backend(avatar: Avatar, backend: str) -> None:
+    """Selects the rasteriser of F and S."""
+    # S is drawn by a part of its own.
+    avatar.backend = backend
+    if avatar.segmentation is not None:
+        avatar.segmentation.backend = backend
+
+
 @contextmanager
 def changed(avatar: Avatar, way: Way) -> Iterator[None]:
-    """Gives the avatar the accuracy and window of a way, and restores its own afterwards."""
+    """Gives the avatar the accuracy, rasteriser and window of a way, and restores its own
+    afterwards."""
     before = avatar.accuracy, avatar.window_margin, avatar.generator_margin
     # how pixels are formed belongs to the model, not to the preset
     if way.accuracy is not None:
@@ -151,6 +159,7 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
             for k in ("low_pass", "supersample", "antialias")
         }
         avatar.accuracy = replace(way.accuracy, **formed)
+    set_backend(avatar, way.backend)
     if way.whole:
         avatar.window_margin = avatar.generator_margin = None
     try:
@@ -182,7 +191,7 @@ def run(config: DictConfig, folder: Path) -> None:
         DataError: when a run or its data cannot be read.
     """
     common.check_whole(config, repeats=1, images=1)
-    above("patience", config.patience)
+    positive("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
     bench = bench_common.Bench.start("trade_off", config, folder)

@@ -30,8 +30,8 @@ def main() -> None:
     # The command sees its own arguments, as after python -m.
     module = f"gsgan.{sys.argv.pop(1)}"
     if module not in COMMANDS:
-        known = ", ".join(name.removeprefix("gsgan.") for name in COMMANDS)
-        sys.exit(f"{module} is not a command; expected one of {known}")
+        commands = ", ".join(name.removeprefix("gsgan.") for name in COMMANDS)
+        sys.exit(f"{module} is not a command; expected one of {commands}")
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 

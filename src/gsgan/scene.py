@@ -252,7 +252,7 @@ class Frame(TensorRecord):
         camera_index: ``[B]`` int64 into the dataset's camera names.
         body: pose of the skinned body, or None when the data has none.
         labels: ``[B, H, W]`` int64 part labels, 0 = background, or None.
-        unsure: ``[B, 1, H, W]`` 1 where colours are excluded from the losses, or None.
+        ignored: ``[B, 1, H, W]`` 1 where colours are excluded from the losses, or None.
     """
 
     image: Tensor
@@ -264,7 +264,7 @@ class Frame(TensorRecord):
     camera_index: Tensor
     body: BodyPose | None = None
     labels: Tensor | None = None
-    unsure: Tensor | None = None
+    ignored: Tensor | None = None
 
     def __len__(self) -> int:
         return self.image.shape[0]
@@ -290,7 +290,7 @@ class Frame(TensorRecord):
             image=unit(self.image),
             mask=unit(self.mask),
             labels=None if self.labels is None else self.labels.long(),
-            unsure=None if self.unsure is None else unit(self.unsure),
+            ignored=None if self.ignored is None else unit(self.ignored),
         )
 
 
@@ -385,7 +385,7 @@ class Window:
             image=self.cut(frame.image),
             mask=self.cut(frame.mask),
             labels=None if frame.labels is None else self.cut(frame.labels),
-            unsure=None if frame.unsure is None else self.cut(frame.unsure),
+            ignored=None if frame.ignored is None else self.cut(frame.ignored),
             camera=self.camera(frame.camera),
         )
 

@@ -27,7 +27,7 @@ def test_a_smaller_count_changes_nothing(body):
     assert subdivide(body, 100) is body
 
 
-@pytest.mark.parametrize("more", [1, 1000, 30_000, 100_000])
+@pytest.mark.parametrize("more", [1, 1000, 30_000])
 def test_the_surface_stays(body, more):
     """Area, volume, orientation and closedness; the body's own vertices come first."""
     count = len(body.vertices) + more
@@ -72,7 +72,7 @@ def test_new_vertices_move_with_their_edge(body):
 def test_points_for_images_are_as_far_apart_as_asked(body):
     """Also for a person twice as large in the images; within the bounds."""
     height = 1.8757
-    for scale in (150.0, 300.0):
+    for scale in (80.0, 160.0):
         count = points_for(height, scale, spacing=1.5)
         points = BodyPoints(body, height, points="auto", scale=scale).points
         assert len(points) == count

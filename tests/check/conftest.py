@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configs import check_limits, check_sampling
 
 from gsgan.check.report import CheckReport
-from gsgan.check.settings import Limits, Sampling
 
 
 @pytest.fixture(scope="session")
@@ -56,7 +56,7 @@ def check(monkeypatch):
         consistency: dict | None = None,
         **limits: float,
     ) -> CheckReport:
-        sampling = Sampling(images=images, shown=1)
+        sampling = check_sampling(images=images, shown=1)
         reader = CaptureReader(
             consistency=Consistency(
                 **({"refused_below": 0.2} | (consistency or {}))
@@ -64,7 +64,9 @@ def check(monkeypatch):
         )
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised
-        return check_data(data, sampling, Limits(limb_share=2.0, **limits))
+        return check_data(
+            data, sampling, check_limits(limb_share=2.0, **limits)
+        )
 
     return run
 

@@ -114,7 +114,7 @@ def test_a_band_round_the_outline_is_left_out_of_the_loss(tmp_path):
         write_tiny_capture(tmp_path), Thresholds()
     )
     frame = CaptureDataset(layout, items(layout))[0]
-    band = frame.unsure[0, 0] > 0
+    band = frame.ignored[0, 0] > 0
     person = frame.mask[0, 0] > 0.5
     assert band.any()
     assert (person & ~band).any()

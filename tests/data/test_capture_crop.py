@@ -222,13 +222,13 @@ def test_what_is_below_the_border_of_an_image_is_unknown(tmp_path):
 
     # The window is padded below; the person goes on there.
     for frame, complete in zip(cut, whole, strict=True):
-        unknown = frame.unsure[0, 0] > 0
+        unknown = frame.ignored[0, 0] > 0
         rows = unknown.all(dim=1)
         assert rows.any()
         assert not unknown[~rows].any()
         assert (frame.labels[0][unknown] == 255).all()
         assert (frame.mask[0, 0][unknown] == 0).all()
-        assert complete.unsure is None
+        assert complete.ignored is None
 
     # A person that ends inside the image does not go on beyond its border.
     for path in (root / "masks").rglob("*.png"):
@@ -236,14 +236,14 @@ def test_what_is_below_the_border_of_an_image_is_unknown(tmp_path):
         mask[-2:] = 0
         cv2.imwrite(str(path), mask)
     for frame in every_frame(root, size=48):
-        assert not frame.unsure.any()
+        assert not frame.ignored.any()
 
 
 def test_losses_and_scores_ignore_what_is_below_the_border(tmp_path):
     root = write_tiny_capture(tmp_path / "cut", size=(48, 48))
     cut_below(root, 26)
     (frame, *_) = every_frame(root, size=48)
-    below = frame.unsure > 0
+    below = frame.ignored > 0
 
     # Two renderings that differ below the border alone.
     image = torch.rand(
@@ -254,7 +254,7 @@ def test_losses_and_scores_ignore_what_is_below_the_border(tmp_path):
     for one in (image, other):
         one = one.clone().requires_grad_()
         loss = photometric(
-            one, frame.image, l1=1.0, ssim=0.0, unsure=frame.unsure
+            one, frame.image, l1=1.0, ssim=0.0, ignored=frame.ignored
         )
         loss.backward()
         assert one.grad[below.expand_as(one.grad)].eq(0).all()

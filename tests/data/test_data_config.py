@@ -91,7 +91,7 @@ def test_configs_of_published_formats_read_them_in_worker_processes(
     data = instantiate(conf(name, *words))
     batch = next(iter(data.train_dataloader()))
     assert batch.image.shape == (1, 3, 16, 16)
-    assert (batch.unsure is None) == (body == "smpl")
+    assert (batch.ignored is None) == (body == "smpl")
     assert data.layout.meta.skeleton_source == skeleton
     assert (data.info.body, data.info.frames) == (body, 3)
     assert data.eval_names == ("novel_view", "novel_pose")

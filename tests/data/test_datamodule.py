@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from commands import quiet_trainer
+from configs import effect_settings
 from make import edit_json, skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import (
@@ -23,7 +24,7 @@ from gsgan.data.datamodule import (
     pass_order,
 )
 from gsgan.data.formats.capture import read_capture
-from gsgan.effects import EffectSettings, decide
+from gsgan.effects import decide
 from gsgan.scene import Frame
 from gsgan.utils.config import one_sentence
 from gsgan.utils.errors import ConfigError, DataError
@@ -305,7 +306,7 @@ def test_the_held_out_split_decides_no_effect(tmp_path):
 
     def decisions():
         data = GsganData(str(root), test_cameras=["cam02"], test_share=0.2)
-        return asdict(data.info), decide(data.info, EffectSettings())
+        return asdict(data.info), decide(data.info, effect_settings())
 
     before = decisions()
 

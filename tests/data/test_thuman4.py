@@ -17,7 +17,7 @@ from gsgan.data.formats.smpl_motion import SmplMotion
 from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_mask, read_unsure
+from gsgan.data.pixels import read_ignored, read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import ConfigError
 
@@ -174,30 +174,30 @@ def test_an_alpha_of_exactly_the_threshold_is_the_person(root, smplx_file):
         ).all()
 
 
-def test_the_unsure_band_is_an_option(root, smplx_file):
+def test_the_ignored_band_is_an_option(root, smplx_file):
     """A half plane with a grey strip: the outline's 5 x 5 band, and alphas in between."""
     alpha = np.zeros((44, 52), np.uint8)
     alpha[:, 24:], alpha[:, :8] = 255, 100
     write_picture(root / "masks/cam00/00000000.jpg", alpha)
 
-    def unsure(**settings: Any) -> np.ndarray | None:
+    def ignored(**settings: Any) -> np.ndarray | None:
         layout = read(root, smplx_file, consistency=NO_LOOK, **settings)
         files = layout.mask_files("cam00", 0)
-        return read_unsure(
+        return read_ignored(
             files, read_mask(files, layout.pixels), layout.pixels
         )
 
-    assert unsure() is None
+    assert ignored() is None
     band, both = (
-        unsure(ignore_band=5),
-        unsure(ignore_band=5, ignore_alpha=(5, 250)),
+        ignored(ignore_band=5),
+        ignored(ignore_band=5, ignore_alpha=(5, 250)),
     )
     assert np.flatnonzero(band[20]).tolist() == [22, 23, 24, 25]
     assert np.flatnonzero(both[20]).tolist() == [*range(8), 22, 23, 24, 25]
     layout = read(root, smplx_file, consistency=NO_LOOK, ignore_band=5)
     frame = CaptureDataset(layout, [("cam00", 0)], size=26)[0]
-    assert frame.unsure.shape == (1, 1, 26, 26)
-    assert frame.unsure.unique().tolist() == [0, 1]
+    assert frame.ignored.shape == (1, 1, 26, 26)
+    assert frame.ignored.unique().tolist() == [0, 1]
 
 
 def test_settings_out_of_range():

@@ -3,14 +3,13 @@
 from dataclasses import replace
 
 import pytest
-from configs import build_data
+from configs import build_data, effect_settings
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
 from gsgan.effects import (
     EFFECT_NAMES,
     Effects,
-    EffectSettings,
     ModelParts,
     decide,
 )
@@ -38,7 +37,7 @@ def on(effects: Effects) -> set[str]:
 
 
 def test_a_plain_scene_calls_for_what_it_always_had():
-    assert on(decide(scene(), EffectSettings())) == {"random_background"}
+    assert on(decide(scene(), effect_settings())) == {"random_background"}
 
 
 @pytest.mark.parametrize(
@@ -58,8 +57,8 @@ def test_a_plain_scene_calls_for_what_it_always_had():
 )
 def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
     before, after = (
-        decide(scene(), EffectSettings()),
-        decide(scene(**change), EffectSettings()),
+        decide(scene(), effect_settings()),
+        decide(scene(**change), effect_settings()),
     )
     assert getattr(after, effect).value == value
     assert {
@@ -84,13 +83,13 @@ def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
     ],
 )
 def test_what_could_be_taken_for_a_call_is_none(change, effect):
-    assert not getattr(decide(scene(**change), EffectSettings()), effect).on
+    assert not getattr(decide(scene(**change), effect_settings()), effect).on
 
 
 @pytest.mark.parametrize("scales", [(0.5, 1), (1, 2), (2, 3), (0.5, 0.9)])
 def test_scales_that_are_to_be_rendered_call_for_antialias(scales):
-    assert not decide(scene(), EffectSettings()).antialias.on
-    found = decide(scene(), EffectSettings(rendered_scales=scales)).antialias
+    assert not decide(scene(), effect_settings()).antialias.on
+    found = decide(scene(), effect_settings(rendered_scales=scales)).antialias
     assert found.on
     assert "differ by" in found.why
 
@@ -100,7 +99,7 @@ def test_scales_that_are_to_be_rendered_call_for_antialias(scales):
 )
 def test_rendered_scales_are_two_rising_numbers(scales):
     with pytest.raises(ConfigError, match="rendered_scales"):
-        EffectSettings(rendered_scales=scales)
+        effect_settings(rendered_scales=scales)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +107,7 @@ def test_rendered_scales_are_two_rising_numbers(scales):
 )
 def test_the_degree_follows_the_number_of_cameras(cameras, degree):
     glossy = scene(n_train_cameras=cameras, surface=GLOSSY)
-    assert decide(glossy, EffectSettings()).degree == degree
+    assert decide(glossy, effect_settings()).degree == degree
 
 
 @pytest.mark.parametrize(
@@ -141,10 +140,10 @@ def test_forcing_the_impossible_is_one_sentence_or_left_out(
     setting, change, why
 ):
     with pytest.raises(ConfigError, match=why) as caught:
-        decide(scene(**change), EffectSettings(**setting))
+        decide(scene(**change), effect_settings(**setting))
     assert "\n" not in str(caught.value)
     lenient = decide(
-        scene(**change), EffectSettings(**setting, impossible="off")
+        scene(**change), effect_settings(**setting, impossible="off")
     )
     assert not getattr(lenient, next(iter(setting)), lenient.distortion).on
 
@@ -152,9 +151,9 @@ def test_forcing_the_impossible_is_one_sentence_or_left_out(
 def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
     rational = scene(has_distortion=True, has_rational_lens=True)
     with pytest.raises(ConfigError, match=r"distortion=project.*k4, k5, k6"):
-        decide(rational, EffectSettings(distortion="project"))
+        decide(rational, effect_settings(distortion="project"))
     lenient = decide(
-        rational, EffectSettings(distortion="project", impossible="off")
+        rational, effect_settings(distortion="project", impossible="off")
     )
     assert lenient.distortion.value == "undistort"
     assert "k4" in lenient.distortion.why
@@ -163,13 +162,13 @@ def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
 @pytest.mark.parametrize("word", ["auto", "off", "undistort", "project"])
 def test_a_list_leaves_lenses_to_their_own_word(word):
     bent = scene(has_distortion=True)
-    found = decide(bent, EffectSettings(distortion=word, only=["antialias"]))
+    found = decide(bent, effect_settings(distortion=word, only=["antialias"]))
     assert (
         found.distortion
-        == decide(bent, EffectSettings(distortion=word)).distortion
+        == decide(bent, effect_settings(distortion=word)).distortion
     )
     assert found.distortion.on == (word != "off")
-    named = decide(bent, EffectSettings(distortion=word, only=["distortion"]))
+    named = decide(bent, effect_settings(distortion=word, only=["distortion"]))
     assert named.distortion.on
 
 
@@ -193,12 +192,12 @@ def test_images_are_read_as_the_list_of_effects_says(tiny):
 def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     auto = decide(
         scene(body_inside=1.0, scale_train=(51.0, 590.0)),
-        EffectSettings(),
+        effect_settings(),
         model,
     )
     assert why in getattr(auto, effect).why
     assert not getattr(auto, effect).on
-    forced = EffectSettings(**{effect: "on"})
+    forced = effect_settings(**{effect: "on"})
     with pytest.raises(ConfigError, match=rf"effects\.{effect}=on"):
         decide(scene(), forced, model)
     assert not getattr(
@@ -225,19 +224,16 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
 )
 def test_wrong_settings_are_named(wrong, named):
     with pytest.raises(ConfigError, match=named):
-        EffectSettings(**wrong)
+        effect_settings(**wrong)
 
 
 def test_configs_say_what_their_names_say(compose):
     from hydra.utils import instantiate
 
-    auto, none, every = (
+    none, every = (
         instantiate(compose("train", f"effects={name}").effects)
-        for name in ("auto", "none", "all")
+        for name in ("none", "all")
     )
-    assert auto == EffectSettings(
-        degree_cameras=auto.degree_cameras
-    )  # same values in code and yaml
     assert on(decide(scene(), none)) == set()
     # the camera's own
     assert on(decide(scene(has_distortion=True), none)) == {"distortion"}
@@ -249,14 +245,14 @@ def test_configs_say_what_their_names_say(compose):
 
 
 def test_forced_values_win_over_the_scene():
-    settings = EffectSettings(
+    settings = effect_settings(
         view_dependence=3, antialias=True, random_background=False
     )
     found = decide(scene(), settings)
     assert found.degree == 3
     assert on(found) == {"view_dependence", "antialias"}
-    assert decide(scene(), EffectSettings(view_dependence="on")).degree == 2
-    assert on(decide(scene(), EffectSettings(only=["antialias"]))) == {
+    assert decide(scene(), effect_settings(view_dependence="on")).degree == 2
+    assert on(decide(scene(), effect_settings(only=["antialias"]))) == {
         "antialias"
     }
 
@@ -269,7 +265,7 @@ PRINTED = {
 
 
 def test_fine_print_on_a_body_is_registered():
-    found = decide(scene(**PRINTED), EffectSettings()).registration
+    found = decide(scene(**PRINTED), effect_settings()).registration
     assert found.on
     assert "0.60" in found.why
 
@@ -285,13 +281,13 @@ def test_fine_print_on_a_body_is_registered():
     ],
 )
 def test_why_a_surface_is_not_registered(changes, why):
-    found = decide(scene(**{**PRINTED, **changes}), EffectSettings())
+    found = decide(scene(**{**PRINTED, **changes}), effect_settings())
     assert not found.registration.on
     assert why in found.registration.why
 
 
 def test_registration_without_a_body_is_refused_or_left_out():
-    settings = EffectSettings(registration="on", body_points="off")
+    settings = effect_settings(registration="on", body_points="off")
     with pytest.raises(ConfigError, match="no Gaussians are on a body"):
         decide(scene(**PRINTED), settings)
     settings = replace(settings, impossible="off")
@@ -299,7 +295,7 @@ def test_registration_without_a_body_is_refused_or_left_out():
 
 
 def test_checkpoints_from_before_and_after_an_effect_existed_are_read():
-    stored = decide(scene(), EffectSettings()).plain()
+    stored = decide(scene(), effect_settings()).plain()
     del stored["registration"]
     stored["generator"] = {
         "value": "on",
@@ -322,15 +318,15 @@ def test_checkpoints_from_before_and_after_an_effect_existed_are_read():
 def test_light_is_found_where_the_person_is_seen_from_all_sides(
     changes, parts, value, why
 ):
-    found = decide(scene(**changes), EffectSettings(), ModelParts(**parts))
+    found = decide(scene(**changes), effect_settings(), ModelParts(**parts))
     assert found.light.value == value
     assert why in found.light.why
 
 
 def test_a_run_is_not_resumed_with_other_effects():
     before, now = (
-        decide(scene(), EffectSettings()),
-        decide(scene(darkest=1.0), EffectSettings()),
+        decide(scene(), effect_settings()),
+        decide(scene(darkest=1.0), effect_settings()),
     )
     before.check_same(before.plain())
     with pytest.raises(ConfigError, match=r"effects\.random_background.* on"):

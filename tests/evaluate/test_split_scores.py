@@ -16,10 +16,10 @@ from gsgan.evaluate.scores import (
     Scorer,
     confusion,
     image_scores,
+    make_predictor,
     means,
     miou,
     over_poses,
-    painter,
     score_split,
 )
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
@@ -147,7 +147,7 @@ def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     )
     avatar = Mock(return_value=rendering, segmentation=None)
     white = scorer(MetricVariants(background="white"))
-    found = score_split([(("a", 0), f)], painter(avatar), white)
+    found = score_split([(("a", 0), f)], make_predictor(avatar), white)
     assert found.rows[FULL][0]["psnr"] == math.inf
     assert found.variants[SPLAT]["psnr"] == pytest.approx(
         -10 * math.log10((56 * 0.3**2 + 8 * 0.15**2) / 576), abs=1e-4

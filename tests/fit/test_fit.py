@@ -163,7 +163,9 @@ def test_what_is_written_is_read(fitted, people, compose):
 def test_scores_say_that_held_out_frames_were_registered(
     fitted, fit, people, compose, tmp_path
 ):
-    options = ScoreOptions(lpips={"nets": [], "path": None})
+    options = ScoreOptions(
+        lpips={"nets": [], "path": None}, score_images=None, grid_rows=4
+    )
     assert not any(
         "fitted" in mark
         for mark in make_scorer(options, GsganData(str(fitted)), []).marks
@@ -355,26 +357,26 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
 
 
 def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
-    """Pixels of a window outside the camera's image are unsure, and the fit ignores them."""
+    """Pixels of a window outside the camera's image are ignored, and the fit ignores them."""
     oblong = write_tiny_capture(
         tmp_path / "oblong", cameras=2, frames=2, size=(96, 64)
     )
     data = GsganData(str(oblong), size=48)
     frames = MaskedFrames(data, torch.device("cpu"))
     frame = frames.silhouettes(0)[0]
-    beyond = frame.unsure > 0.5
+    beyond = frame.ignored > 0.5
     assert beyond.float().mean() == pytest.approx(1 / 3)
     assert float(frame.mask[beyond].max()) == 0
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     inside = GsganData(str(people), size=48)
     assert (
-        MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].unsure
+        MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].ignored
         is None
     )
 
 
-def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
+def test_the_rims_of_an_undistorted_image_are_ignored(tmp_path):
     bent = write_tiny_capture(
         tmp_path / "bent",
         cameras=2,
@@ -385,8 +387,8 @@ def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     frame = MaskedFrames(
         GsganData(str(bent), size=48), torch.device("cpu")
     ).silhouettes(0)[0]
-    assert float(frame.unsure[0, 0, 0, 0]) == 1
-    assert float(frame.unsure[0, 0, 24, 24]) == 0
+    assert float(frame.ignored[0, 0, 0, 0]) == 1
+    assert float(frame.ignored[0, 0, 24, 24]) == 0
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,12 @@ from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Prediction, Preparation
 from gsgan.evaluate.scores import BOX_METRICS, Scorer, score_split
 from gsgan.metrics.names import FULL
-from gsgan.metrics.regions import HANDS, MOUTH, describe_boxes, hands_and_mouth
+from gsgan.metrics.regions import (
+    HANDS_REGION,
+    MOUTH,
+    describe_boxes,
+    hands_and_mouth,
+)
 from gsgan.scene import Camera, Frame
 from gsgan.skeleton import TEMPLATES
 
@@ -82,28 +87,29 @@ def unseen(f: Frame, *parts: slice) -> Frame:
 
 def test_boxes_counted_by_hand():
     boxes = hands_and_mouth(signer(), TEMPLATE)
-    assert torch.equal(boxes[HANDS], LEFT_BOX | RIGHT_BOX)
+    assert torch.equal(boxes[HANDS_REGION], LEFT_BOX | RIGHT_BOX)
     assert torch.equal(boxes[MOUTH], MOUTH_BOX)
     assert not hands_and_mouth(signer(), TEMPLATES["mediapipe33"])
 
 
 def test_an_unseen_hand_has_no_box_and_its_estimate_is_not_used():
     f = moved(unseen(signer(), RIGHT), RIGHT, -30)
-    assert torch.equal(hands_and_mouth(f, TEMPLATE)[HANDS], LEFT_BOX)
-    assert not hands_and_mouth(unseen(f, LEFT), TEMPLATE)[HANDS].any()
+    assert torch.equal(hands_and_mouth(f, TEMPLATE)[HANDS_REGION], LEFT_BOX)
+    assert not hands_and_mouth(unseen(f, LEFT), TEMPLATE)[HANDS_REGION].any()
     # 14 x 7 pixels are left
     some = unseen(signer(), RIGHT, slice(LEFT.start + 15, LEFT.stop))
     assert torch.equal(
-        hands_and_mouth(some, TEMPLATE)[HANDS], rectangle((28, 39), (18, 36))
+        hands_and_mouth(some, TEMPLATE)[HANDS_REGION],
+        rectangle((28, 39), (18, 36)),
     )
 
 
 def test_a_box_is_clipped_at_the_border_and_gone_beyond_it():
     f = unseen(signer(), RIGHT)
-    cut = hands_and_mouth(moved(f, LEFT, -30), TEMPLATE)[HANDS]
+    cut = hands_and_mouth(moved(f, LEFT, -30), TEMPLATE)[HANDS_REGION]
     assert torch.equal(cut, rectangle((27, 43), (0, 13)))
     gone = hands_and_mouth(moved(f, LEFT, -41), TEMPLATE)[
-        HANDS
+        HANDS_REGION
     ]  # all but the margin
     assert not gone.any()
     behind = replace(f, skeleton=f.skeleton * torch.tensor([1.0, 1.0, -1.0]))
@@ -160,7 +166,7 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
         (math.ceil(y0), int(y1) + 1), (math.ceil(x0), int(x1) + 1)
     )
     assert torch.equal(
-        boxes[HANDS] & ~rectangle((50, 100), (60, 120)), expected
+        boxes[HANDS_REGION] & ~rectangle((50, 100), (60, 120)), expected
     )
 
 

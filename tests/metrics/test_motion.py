@@ -60,11 +60,11 @@ def unwarped(error: Tensor, error_before: Tensor) -> float:
 def test_the_motion_of_the_truth_is_found_on_the_person_alone():
     motion = truth_motion(TRUTH, MASK, TRUTH_BEFORE, MASK_BEFORE)
     inner = person(AT + STEP, grow=-4)[0, 0].bool().numpy()
-    y, x = np.nonzero(inner & motion.known)
+    y, x = np.nonzero(inner & motion.has_place)
     assert len(x) > 0.95 * inner.sum()
     np.testing.assert_allclose(motion.places[y, x, 0], x - STEP, atol=0.1)
     np.testing.assert_allclose(motion.places[y, x, 1], y, atol=0.1)
-    assert not motion.known[:8].any()
+    assert not motion.has_place[:8].any()
 
 
 def test_texture_that_sticks_to_the_surface_scores_0():
@@ -110,7 +110,9 @@ def test_what_appears_from_behind_something_does_not_count():
     motion = truth_motion(target, MASK, TRUTH_BEFORE, MASK_BEFORE)
     hidden = stripe[0, 0].numpy()
     others = MASK[0, 0].bool().numpy() & ~hidden
-    assert motion.known[hidden].mean() < 0.5 * motion.known[others].mean()
+    assert (
+        motion.has_place[hidden].mean() < 0.5 * motion.has_place[others].mean()
+    )
 
 
 def test_a_black_image_has_a_finite_score():
@@ -133,7 +135,7 @@ def test_without_a_person_or_in_a_tiny_image_there_is_no_score():
     motion = truth_motion(
         TRUTH[part], MASK[part], TRUTH_BEFORE[part], MASK_BEFORE[part]
     )
-    assert not motion.known.any()
+    assert not motion.has_place.any()
 
 
 def test_a_thin_person_in_a_large_image_has_a_score():
@@ -141,4 +143,4 @@ def test_a_thin_person_in_a_large_image_has_a_score():
     thin[..., 10:-10, 30:32] = 1
     target = 0.5 * thin.expand(-1, 3, -1, -1)
     motion = truth_motion(target, thin, target, thin)
-    assert motion.known.sum() == thin.sum()
+    assert motion.has_place.sum() == thin.sum()

@@ -10,7 +10,7 @@ from tiny_characters import TINY
 
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
-from gsgan.model.segmentation import HANDS, Segmentation
+from gsgan.model.segmentation import HAND_LABELS, Segmentation
 from gsgan.motion.character import Character
 from gsgan.synthetic import ensure_scene, scene_setup
 from gsgan.synthetic.camera import pixel_rays
@@ -31,7 +31,7 @@ def overlaps(scene: Scene, camera: str, frame: int) -> torch.Tensor:
         rays.astype(np.float32),
     )
     character, both = scene.character, np.ones(SIZE * SIZE, bool)
-    for name in HANDS:
+    for name in HAND_LABELS:
         faces = character.faces[
             character.labels == character.label_names.index(name)
         ]

@@ -58,7 +58,7 @@ def write_pose(
     path: Path,
     parts: dict[str, tuple[list[str], np.ndarray]],
     layout: str = "XYZC",
-    unsure: tuple[int, ...] = (),
+    ignored: tuple[int, ...] = (),
 ) -> Path:
     """A .pose file of parts: names of points, and points ``[F, n, 3]`` with NaN where not seen."""
     pose_format = pytest.importorskip("pose_format")
@@ -76,7 +76,7 @@ def write_pose(
     header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), components)
     q = np.concatenate([q for _, q in parts.values()], axis=1)
     seen = np.isfinite(q).all(-1)[:, None].astype(np.float64)
-    seen[..., unsure] *= 0.4
+    seen[..., ignored] *= 0.4
     with path.open("wb") as stream:
         body = NumPyPoseBody(25, np.nan_to_num(q)[:, None], seen)
         pose_format.Pose(header, body).write(stream)
@@ -298,7 +298,7 @@ def test_people_filmed_from_the_waist_up_stand_upright(
     q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
     parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
     p, _ = standard(
-        write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), proportions
+        write_pose(tmp_path / "a.pose", parts, ignored=(23, 24)), proportions
     )
     spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
     np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)

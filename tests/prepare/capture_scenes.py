@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from configs import prepare_options, solve_settings
 from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
 from rich.console import Console
 
@@ -14,7 +15,6 @@ from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.frontier import Outline
 from gsgan.prepare.options import Options
-from gsgan.prepare.solve import SolveSettings
 
 ANGLES = (0.0, 1.3, 2.7, 4.2)
 LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
@@ -158,13 +158,13 @@ def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
 def options(project: Path, **more) -> Options:
     """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
-        "solve": SolveSettings(refinements=0, body=False),
+        "solve": solve_settings(refinements=0, body=False),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
         "masks": str(project / "masks"),
     }
-    return Options(**(given | more))
+    return prepare_options(**(given | more))
 
 
 def quiet() -> Console:

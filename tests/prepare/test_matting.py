@@ -124,8 +124,8 @@ def test_the_room_is_found_behind_someone_who_walks(recording):
     source, masks = recording
     studied = study_room(source, masks, range(12), LEVELS)
     assert studied.room is not None
-    assert studied.room.known.mean() > 0.95
-    error = np.abs(studied.room.colour - wall())[studied.room.known]
+    assert studied.room.seen.mean() > 0.95
+    error = np.abs(studied.room.colour - wall())[studied.room.seen]
     assert np.median(error) < 1
     assert np.percentile(error, 99) < 12
     for frame, found in studied.alphas.items():

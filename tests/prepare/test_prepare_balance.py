@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configs import mediapipe_tool, prepare_options
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.mediapipe import READY, environment_of
-from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        not (environment_of(MediaPipe()) / READY).is_file(),
+        not (environment_of(mediapipe_tool()) / READY).is_file(),
         reason="no MediaPipe environment: python -m gsgan.prepare … setup=true makes it",
     ),
 ]
@@ -32,7 +32,7 @@ pytestmark = [
 def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     """The calibration is a degree or two off; points end within 6 px of the detections."""
     source = DATA / "balance_videos"
-    given = Options(str(source), str(tmp_path / "out"))
+    given = prepare_options(source=str(source), out=str(tmp_path / "out"))
     out = prepare(given, Console(file=io.StringIO()))
     numbers = json.loads((out / "prepare.json").read_text())
     error = numbers["error_px"]
@@ -83,8 +83,11 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
 def test_gestures_in_front_of_webcams(tmp_path):
     """His legs are outside every image."""
     source = str(DATA / "hands_videos")
-    given = Options(
-        source, str(tmp_path / "out"), frames="6-60", offsets={"cam_1": -1}
+    given = prepare_options(
+        source=source,
+        out=str(tmp_path / "out"),
+        frames="6-60",
+        offsets={"cam_1": -1},
     )
     out = prepare(given, Console(file=io.StringIO()))
     numbers = json.loads((out / "prepare.json").read_text())

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_scenes import LENS, ring, write_own, write_qualisys, write_toml
+from configs import mediapipe_tool, prepare_options
 from make import damaged, skeletons
 from test_prepare_points3d import write_trc
 from writers.easymocap import write_calibration
@@ -24,7 +25,6 @@ from gsgan.motion.points import read_points3d
 from gsgan.prepare.camera_array import undistort_points
 from gsgan.prepare.dataset import publish
 from gsgan.prepare.landmarks import read_detections
-from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.stages import StageFolder
 from gsgan.skeleton.joints import BODY
 from gsgan.utils.errors import ConfigError, DataError, GsganError
@@ -32,7 +32,7 @@ from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 def test_a_folder_with_a_users_file_is_never_removed(tmp_path):
     (tmp_path / "thesis.txt").write_text("do not lose")
-    given = MediaPipe(folder=str(tmp_path), python=sys.executable)
+    given = mediapipe_tool(folder=str(tmp_path), python=sys.executable)
     with pytest.raises(ConfigError, match=r"mediapipe\.folder"):
         tool.ensure_environment(given, True, print)
     assert (tmp_path / "thesis.txt").read_text() == "do not lose"
@@ -40,7 +40,9 @@ def test_a_folder_with_a_users_file_is_never_removed(tmp_path):
 
 def test_a_half_made_environment_is_made_again(tmp_path):
     place = tmp_path / "env"
-    missing = MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
+    missing = mediapipe_tool(
+        folder=str(place), python=str(tmp_path / "python9")
+    )
     for _ in range(2):  # the second time the folder is there, with the marker
         with pytest.raises(DataError, match="python9"):
             tool.ensure_environment(missing, True, print)
@@ -60,7 +62,7 @@ def test_commands_that_start_at_once_make_one_environment(
         time.sleep(0.05)
 
     monkeypatch.setattr(tool, "_run", run)
-    given = MediaPipe(folder=str(tmp_path / "env"), python=sys.executable)
+    given = mediapipe_tool(folder=str(tmp_path / "env"), python=sys.executable)
     with ThreadPoolExecutor(2) as pool:
         found = list(
             pool.map(
@@ -170,7 +172,7 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(
 )
 def test_options_of_the_wrong_kind(more):
     with pytest.raises(ConfigError, match=next(iter(more))):
-        Options("source", "out", **more)
+        prepare_options(source="source", out="out", **more)
 
 
 def test_strong_lenses_are_undistorted_to_the_corners():

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from capture_scenes import no_outlines, ring, seen
+from configs import solve_settings
 from make import skeletons
 
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
 from gsgan.prepare.sides import apply_flips
-from gsgan.prepare.solve import Solution, SolveSettings, solve
+from gsgan.prepare.solve import Solution, solve
 from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.skeleton.joints import BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 
@@ -41,7 +42,7 @@ def person(frames: int = FRAMES) -> np.ndarray:
 
 def solved(rig: CameraArray, uv: np.ndarray, conf: np.ndarray) -> Solution:
     conf = np.where(np.isfinite(uv).all(-1), conf, 0.0)
-    settings = SolveSettings(refinements=0, body=False)
+    settings = solve_settings(refinements=0, body=False)
     without = no_outlines(*conf.shape[:2])
     return solve(rig, np.arange(FRAMES) / 30, uv, conf, without, settings)
 

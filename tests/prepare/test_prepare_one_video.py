@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from configs import prepare_options
 from one_person import film, turning, world_landmarks
 from rich.console import Console
 
@@ -56,7 +57,7 @@ def options(video, **more) -> Options:
         "height": TALL,
         "focal": 520 / np.hypot(360, 640) * np.hypot(36, 24),
     }
-    return Options(**given | more)
+    return prepare_options(**given | more)
 
 
 @pytest.fixture(scope="session")

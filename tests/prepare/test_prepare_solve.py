@@ -11,6 +11,7 @@ from capture_scenes import (
     seen,
     turned,
 )
+from configs import solve_settings
 from make import distorted_pixels, skeletons
 
 from gsgan.prepare import triangulate
@@ -23,7 +24,6 @@ from gsgan.prepare.camera_array import (
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.sides import apply_flips, find_flips
 from gsgan.prepare.solve import (
-    SolveSettings,
     correct,
     median,
     refine,
@@ -205,7 +205,7 @@ def test_all_stages_together_end_near_the_truth():
     given = turned(rig, 3, degrees=1.0, metres=0.02)
     silhouettes = outlines(uv)
     found = solve(
-        given, np.arange(16) / 6, swapped, conf, silhouettes, SolveSettings()
+        given, np.arange(16) / 6, swapped, conf, silhouettes, solve_settings()
     )
     medians = {name: median(error) for name, error in found.stages.items()}
     assert list(medians) == ["plain", "robust", "flips", "refined", "body"]
@@ -224,7 +224,7 @@ def test_nobody_seen_ends_without_joints_or_warnings():
         np.full_like(uv, np.nan),
         0 * conf,
         no_outlines(4, 3),
-        SolveSettings(),
+        solve_settings(),
     )
     assert np.isnan(found.p).all()
     assert (found.conf == 0).all()
@@ -243,7 +243,7 @@ def found_by(given, uv, conf, silhouettes):
     cameras, scaled = given.normalise(uv)
     time = np.arange(conf.shape[1]) / 30
     corrected = correct(cameras, scaled, conf, time)
-    return refine(given, corrected, silhouettes, SolveSettings())
+    return refine(given, corrected, silhouettes, solve_settings())
 
 
 def test_an_exact_calibration_is_kept_although_landmarks_are_biased():
@@ -303,4 +303,4 @@ def test_without_silhouettes_the_given_cameras_are_kept():
 )
 def test_settings_out_of_range_are_named(name, value):
     with pytest.raises(ConfigError, match=name):
-        SolveSettings(**{name: value})
+        solve_settings(**{name: value})

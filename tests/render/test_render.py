@@ -19,7 +19,7 @@ from PIL import Image
 from gsgan.body.shape import free_space
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
-from gsgan.evaluate.scores import painter
+from gsgan.evaluate.scores import make_predictor
 from gsgan.render import run as render_run
 from gsgan.run.runs import Run, load
 from gsgan.run.stored import CHECKPOINT, CONFIG, load_config
@@ -81,7 +81,7 @@ def expected(
     """What evaluation scores, as bytes, by camera and frame."""
     config = load_config(run)
     data = build_data(config)
-    predict = painter(load_avatar(run, config, data)[0], solve=solve)
+    predict = make_predictor(load_avatar(run, config, data)[0], solve=solve)
     prepare = Preparation(MetricVariants(background=background), None)
     found = {}
     dataset = data.dataset(split)

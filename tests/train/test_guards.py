@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from configs import rollback_settings
 
 from gsgan.train.optimisers import Recipe
-from gsgan.train.rollback import Rollback
 from gsgan.train.schedule import Rate
 from gsgan.utils.errors import ConfigError
 
@@ -48,7 +48,7 @@ def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(
 
 def test_ranks_decide_together_whether_the_person_has_vanished():
     """Two ranks: one sees the person, one does not; alone they would decide differently."""
-    ranks = [Rollback(memory=0.0), Rollback(memory=0.0)]
+    ranks = [rollback_settings(memory=0.0), rollback_settings(memory=0.0)]
     for rank, alpha in zip(ranks, (0.3, 0.0), strict=True):
         maps = (torch.full((1, 1, 4, 4), x) for x in (alpha, 0.3))
         rank.watch(**dict(zip(("alpha", "mask"), maps, strict=True)))
@@ -81,7 +81,7 @@ def test_training_asks_all_ranks(make, monkeypatch):
 
 
 def test_an_alpha_that_is_not_finite_is_no_collapse():
-    rollback = Rollback()
+    rollback = rollback_settings()
     mask = torch.full((1, 1, 4, 4), 0.3)
     for alpha in (0.3, float("nan"), 0.3):
         rollback.watch(alpha=torch.full((1, 1, 4, 4), alpha), mask=mask)
@@ -114,4 +114,10 @@ def test_a_span_that_is_not_read_is_refused(make):
 
 def test_a_span_is_both_steps_or_the_first():
     with pytest.raises(ConfigError, match=r"span.*both, step_one.*'all'"):
-        Recipe(Rate(1e-3), span="all")
+        Recipe(
+            Rate(1e-3, 0.5, 0.0, 0, "cosine"),
+            (0.9, 0.99),
+            1e-8,
+            None,
+            span="all",
+        )

@@ -37,11 +37,11 @@ def leaves(*channels: int, size: int = 16) -> list[torch.Tensor]:
 
 
 def seen_person(size: int = 16) -> SimpleNamespace:
-    """A person in the middle, unsure at the right side."""
-    mask, unsure = torch.zeros(1, 1, size, size), torch.zeros(1, 1, size, size)
-    mask[..., 4:12, 4:12], unsure[..., 13:] = 1.0, 1.0
+    """A person in the middle, ignored at the right side."""
+    mask, ignored = torch.zeros(1, 1, size, size), torch.zeros(1, 1, size, size)
+    mask[..., 4:12, 4:12], ignored[..., 13:] = 1.0, 1.0
     return SimpleNamespace(
-        image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, unsure=unsure
+        image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, ignored=ignored
     )
 
 
@@ -64,7 +64,7 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
 
     found = terms(weights)
     off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (
-        frame.unsure == 0
+        frame.ignored == 0
     )
     assert float(found["alpha"].detach()) == pytest.approx(
         2 * float(0.5 * off.abs().mean() + 3 * off.square().mean()), rel=1e-5
@@ -120,7 +120,7 @@ def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
     )
     on_black = with_alpha(painting, frame, None, None)
     (slope,) = torch.autograd.grad(on_black, alpha)
-    off = (alpha - frame.mask).detach() * (frame.unsure == 0)
+    off = (alpha - frame.mask).detach() * (frame.ignored == 0)
     torch.testing.assert_close(slope, 0.3 * off.sign() / off.numel())
     black = without(painting, frame, None, None)
     assert torch.autograd.grad(black, alpha, allow_unused=True) == (None,)

@@ -53,7 +53,12 @@ def test_two_processes_have_the_losses_of_one_with_the_whole_batch(
         } | more
         torch.manual_seed(0)
         module, trainer, data = make(
-            f"data.batch_size={batch}", "model.window_margin=null", **given
+            f"data.batch_size={batch}",
+            "model.window_margin=null",
+            "training.schedule.segmentation=2",
+            "training.schedule.step_one=2",
+            "training.schedule.step_two=4",
+            **given,
         )
         trainer.fit(module, data)
         found.append(json.loads(path.read_text()))

@@ -18,7 +18,12 @@ from torch.utils.data import DataLoader
 
 import gsgan
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.evaluate.scores import Preparation, Scorer, painter, score_split
+from gsgan.evaluate.scores import (
+    Preparation,
+    Scorer,
+    make_predictor,
+    score_split,
+)
 
 SOURCE = Path(gsgan.__file__).parent
 # checks of values, boxes of p₂D's lines, and the box that the generator paints
@@ -129,7 +134,7 @@ def test_scoring_an_image_reads_no_more_values_than_these(tiny):
     The rest are scores, which become numbers; how many depends on the parts that an image shows.
     """
     data, module = build_training(tiny("model.backend=native"))
-    predict = painter(module.avatar.freeze())
+    predict = make_predictor(module.avatar.freeze())
     items = list(data.dataset("novel_pose").items)[:3]
     frames = [data.dataset("novel_pose")[i] for i in range(3)]
     scorer = Scorer(Preparation(MetricVariants(), None))

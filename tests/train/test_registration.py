@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from commands import TINY
-from configs import build_training
+from configs import build_training, registration_settings
 from rich.console import Console
 
 from gsgan.body import open_body
@@ -16,13 +16,14 @@ from gsgan.model.body_points import BodyPoints
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import rasterise
 from gsgan.train.registration import (
-    Drawn,
     MovingSurface,
-    Registered,
-    Registration,
+    SurfaceOffsets,
+    linear_fit,
+)
+from gsgan.train.surface_flow import (
+    Drawn,
     TrainingView,
     flow_between,
-    linear_fit,
     projection_slope,
     sample_image,
 )
@@ -33,7 +34,10 @@ REGISTERED = (
     "model=splat_only",
     ON,
     "effects.registration=on",
+    "training.registration.frames=2",
+    "training.registration.cameras=1",
 )
+SETTINGS = registration_settings()
 SIZE = 192
 BENT = "upperarm01.L"
 
@@ -137,7 +141,7 @@ def avatar_of(placed) -> SimpleNamespace:
 @pytest.fixture(scope="module")
 def found(painted):
     """The offsets of each frame, before any is explained by the pose."""
-    surface = MovingSurface(avatar_of(painted.placed), painted, Registration())
+    surface = MovingSurface(avatar_of(painted.placed), painted, SETTINGS)
     return surface.align_frames(range(4), Console(quiet=True))
 
 
@@ -160,7 +164,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
         torch.stack([pose.theta[0] for pose in painted.poses]),
         torch.zeros_like(painted.offsets),
     )
-    surface = MovingSurface(avatar_of(painted.placed), still, Registration())
+    surface = MovingSurface(avatar_of(painted.placed), still, SETTINGS)
     found = surface.align_frames(range(4), Console(quiet=True))
     # a third of a pixel
     assert found.norm(dim=2).median() < 0.0035
@@ -168,7 +172,7 @@ def test_a_body_whose_surface_is_right_stays(painted):
 
 def test_what_the_pose_explains_starts_the_offsets(painted, found):
     placed = deepcopy(painted.placed)
-    registered = Registration()(avatar_of(placed), painted, Console(quiet=True))
+    registered = SETTINGS(avatar_of(placed), painted, Console(quiet=True))
     with torch.no_grad():
         for frame, pose in enumerate(painted.poses):
             rest = registered.of(torch.tensor([frame]))
@@ -246,7 +250,7 @@ def test_slopes_are_those_of_the_projection():
 
 
 def test_frames_that_were_not_registered_have_no_offsets():
-    registered = Registered(torch.tensor([3, 8]), torch.ones(2, 5, 3))
+    registered = SurfaceOffsets(torch.tensor([3, 8]), torch.ones(2, 5, 3))
     found = registered.of(torch.tensor([8, 4]))
     assert found[0].eq(1).all()
     assert found[1].eq(0).all()
@@ -280,7 +284,7 @@ def test_whether_a_run_registers_is_decided_by_its_scene(tiny):
 
 def test_a_negative_weight_is_refused():
     with pytest.raises(ConfigError, match="smooth"):
-        Registration(smooth=-1)
+        registration_settings(smooth=-1)
 
 
 def test_only_training_frames_have_offsets_of_their_own(tiny):
@@ -295,7 +299,7 @@ def test_only_training_frames_have_offsets_of_their_own(tiny):
     module.avatar.forward = watched
     frame = data.dataset("train")[0]
     controls = len(module.avatar.body_points.points.learnt.field)
-    module.registered = Registered(
+    module.surface_offsets = SurfaceOffsets(
         frame.frame_id, torch.full((1, controls, 3), 0.01)
     )
     module.trainer = None
@@ -321,15 +325,15 @@ def test_a_resumed_run_keeps_the_registered_surface(
     assert kept["offsets"].isfinite().all()
     _, module = build_training(tiny(*REGISTERED))
     module.on_load_checkpoint(torch.load(path, weights_only=True))
-    assert torch.equal(module.registered.offsets, kept["offsets"])
-    assert torch.equal(module.registered.frames, kept["frames"])
+    assert torch.equal(module.surface_offsets.offsets, kept["offsets"])
+    assert torch.equal(module.surface_offsets.frames, kept["frames"])
 
 
 def test_training_moves_the_surface_of_its_frames(make):
     module, trainer, data = make(*REGISTERED)
     frames = torch.tensor(data.trained)
     controls = len(module.avatar.body_points.points.learnt.field)
-    module.registered = Registered(
+    module.surface_offsets = SurfaceOffsets(
         frames, 0.001 * torch.randn(len(frames), controls, 3)
     )
     given = []

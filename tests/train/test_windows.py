@@ -49,6 +49,9 @@ def test_every_phase_trains_on_parts(make, margin):
         "training.window=16",
         f"model.window_margin={margin}",
         "size.image=48",
+        "training.schedule.segmentation=2",
+        "training.schedule.step_one=2",
+        "training.schedule.step_two=4",
         callbacks=[sizes],
     )
     trainer.fit(module, data)

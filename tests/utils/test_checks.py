@@ -2,15 +2,15 @@
 
 import pytest
 
-from gsgan.utils.checks import above, at_least, between, one_of, whole
+from gsgan.utils.checks import at_least, between, integer, one_of, positive
 from gsgan.utils.errors import ConfigError
 
 
 def test_good_values_come_back():
     assert at_least("a", 1.5, 1.5) == 1.5
-    assert above("a", 0.1) == 0.1
+    assert positive("a", 0.1) == 0.1
     assert between("a", 1, 0, 1) == 1
-    assert whole("a", 3, 3) == 3
+    assert integer("a", 3, 3) == 3
     assert one_of("a", "x", ("x", "y")) == "x"
 
 
@@ -27,13 +27,13 @@ def test_good_values_come_back():
         ),
         (lambda: at_least("a", float("nan"), 0), "got nan"),
         (lambda: at_least("a", "1", 0), "got '1'"),
-        (lambda: above("a", 0), "a must be a number above 0, got 0"),
+        (lambda: positive("a", 0), "a must be a number above 0, got 0"),
         (
             lambda: between("a", 2, 0, 1),
             "a must be a number from 0 to 1, got 2",
         ),
         (
-            lambda: whole("a", 1.5, 1),
+            lambda: integer("a", 1.5, 1),
             "a must be a whole number of at least 1, got 1.5",
         ),
         (

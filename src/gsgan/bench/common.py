@@ -13,7 +13,7 @@ import pandas as pd
 import torch
 
 from gsgan.utils import pages
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 
 NOTHING = "–"  # for a value that was not measured
 
@@ -93,4 +93,4 @@ def markdown(frame: pd.DataFrame) -> str:
 def check_whole(values: Mapping[str, Any], **minimum: int) -> None:
     """Raises ConfigError for keys that are not whole numbers of at least the given value."""
     for name, low in minimum.items():
-        whole(name, values[name], low)
+        integer(name, values[name], low)

@@ -113,7 +113,7 @@ def run(options: SpeedOptions) -> None:
 
     # The run is loaded once; the same painter is timed one by one and in batches.
     avatar, frames, name, marks = load_subject(options, device)
-    painter = make_painter(avatar, options.precision, options.backend)
+    painter = make_painter(avatar, options.precision)
     with without_denormals(), progress(console) as bars:
         task = bars.add_task("painting", total=options.warmup + options.frames)
         times = measure(
@@ -172,7 +172,8 @@ def load_subject(
         folder = Path(source.run).expanduser()
         stored = RunSettings.from_config(load_config(folder, source.paths))
         data = stored.data.read()
-        avatar, marks = load_avatar(folder, stored.avatar, data)
+        settings = stored.avatar.with_backend(options.backend)
+        avatar, marks = load_avatar(folder, settings, data)
         name = f"trained run {folder.name}"
         frames = spread(data, options.poses)
 
@@ -181,7 +182,8 @@ def load_subject(
         source.paths.refuse_without_run()
         data = options.untrained.data.read()
         images = data.select_labelled("train")
-        avatar = build_avatar(options.untrained.avatar, data.info, images)
+        settings = options.untrained.avatar.with_backend(options.backend)
+        avatar = build_avatar(settings, data.info, images)
         name = "untrained avatar"
         marks = [
             "untrained weights: the time of F depends on the places of its Gaussians"
@@ -224,25 +226,13 @@ def place(
     return avatar.freeze().to(device=device, memory_format=layout)  # type: ignore[call-overload]
 
 
-def set_backend(avatar: Avatar, backend: str) -> None:
-    """Selects the rasteriser of F and S."""
-    # S is drawn by a part of its own.
-    avatar.backend = backend
-    if avatar.segmentation is not None:
-        avatar.segmentation.backend = backend
-
-
-def make_painter(
-    avatar: Avatar, precision: str = "32-true", backend: str = "auto"
-) -> Painter:
+def make_painter(avatar: Avatar, precision: str = "32-true") -> Painter:
     """A function of a frame that returns its image ``[B, 3, H, W]``, rendered from its skeleton.
 
     Args:
         avatar: in eval mode.
         precision: of the networks, one of `PRECISIONS`.
-        backend: of both rasterisations.
     """
-    set_backend(avatar, backend)
     dtype = PRECISIONS[precision]
 
     @torch.inference_mode()

@@ -91,8 +91,10 @@ _Job = build.job_type(
 
 def available(skeleton: Tensor) -> bool:
     """Whether `solve` can be used for skeletons of this device and dtype."""
-    known = skeleton.dtype in build.DTYPES and skeleton.device.type != "meta"
-    return known and native.available()
+    is_supported = (
+        skeleton.dtype in build.DTYPES and skeleton.device.type != "meta"
+    )
+    return is_supported and native.available()
 
 
 def to_constants(constants: Mapping[str, Tensor]) -> dict[str, Tensor]:

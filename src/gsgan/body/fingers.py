@@ -191,13 +191,13 @@ class Fingers(nn.Module):
         seen = (weight > 0).unsqueeze(-1)
         rest = self.bones * seen
         now = bones * seen
-        own, others = self.axes.split([3, 2], dim=1)
+        first_axes, others = self.axes.split([3, 2], dim=1)
 
         # The first joint turns the first bone.
-        first = _find_turn(own, rest[:, :, 0], now[:, :, 0])
+        first = _find_turn(first_axes, rest[:, :, 0], now[:, :, 0])
 
         # The second joint turns the sum of those beyond, as the first joint leaves it.
-        before = axis_angle_to_matrix((first.unsqueeze(-1) * own).sum(2))
+        before = axis_angle_to_matrix((first.unsqueeze(-1) * first_axes).sum(2))
         beyond = (now[:, :, 1:].sum(2).unsqueeze(-2) @ before).squeeze(-2)
         second = _find_turn(others, rest[:, :, 1:].sum(2), beyond)
         return torch.cat([first, second], dim=2).clamp(
@@ -219,16 +219,18 @@ class Fingers(nn.Module):
         r = x - torch.cat([seen, seen + further], dim=2)
 
         # Derivatives [B, 10, 5, 3, 3]: the first joint moves all landmarks, the second two.
-        own, others = self.axes.split([3, 2], dim=1)
+        first_axes, others = self.axes.split([3, 2], dim=1)
 
         # The Jacobian turns a change of a number into the turn that it adds.
-        own = own @ left_jacobian(first_turn).mT
+        first_axes = first_axes @ left_jacobian(first_turn).mT
         others = others @ (first @ left_jacobian(second_turn)).mT
 
         # The second joint turns about the middle landmark, which therefore
         # stays.
         arms = torch.cat([torch.zeros_like(middle), beyond], dim=2)
-        J = torch.cat([_velocities(own, x), _velocities(others, arms)], dim=2)
+        J = torch.cat(
+            [_velocities(first_axes, x), _velocities(others, arms)], dim=2
+        )
 
         # The normal equations.
         weighted = (J * weight[:, :, None, :, None]).flatten(3)

@@ -129,9 +129,9 @@ class BodyShape:
         hands = math.prod(HANDS_SHAPE)
         counts = [sum(sizes) + more for more in (0, 1, hands, hands + 1)]
         if values.ndim != 1 or len(values) not in counts:
-            known = " or ".join(map(str, counts))
+            expected = " or ".join(map(str, counts))
             raise ValueError(
-                f"BodyShape: expected {known} numbers, got {list(values.shape)}"
+                f"BodyShape: expected {expected} numbers, got {list(values.shape)}"
             )
 
         # What follows the three groups that every shape has.
@@ -307,9 +307,9 @@ def _with_hands(body: B, hands: Tensor) -> B:
         "joints": joints,
     }
     if isinstance(body, Body):
-        own = body.hand_landmarks + moves[sides[body.hand_bone]]
+        hand_landmarks = body.hand_landmarks + moves[sides[body.hand_bone]]
         own_wrists = torch.tensor([WRIST, HAND + WRIST])
-        changes["hand_landmarks"] = own.index_copy(0, own_wrists, at)
+        changes["hand_landmarks"] = hand_landmarks.index_copy(0, own_wrists, at)
     return replace(body, **changes)
 
 

@@ -81,8 +81,8 @@ class SkinnedBody:
         shape = vertex_labels.shape
         minimum = vertex_labels.min()
         maximum = vertex_labels.max()
-        known = minimum >= 0 and maximum < len(label_names)
-        if shape != self.vertex_labels.shape or not known:
+        in_range = minimum >= 0 and maximum < len(label_names)
+        if shape != self.vertex_labels.shape or not in_range:
             raise ValueError(
                 f"{type(self).__name__}.voted: vertex_labels must be {len(self.vertex_labels)} "
                 f"numbers from 0 to {len(label_names) - 1}, got {list(shape)} from "

@@ -312,7 +312,7 @@ class SkinnedModel:
         names = part_names(parts, self.joint_names)
 
         # The part of each vertex, by its joint with the largest weight, the first of equals.
-        own = [
+        joint_labels = [
             names.index(part_of_joint(parts, joint))
             for joint in self.joint_names
         ]
@@ -331,7 +331,7 @@ class SkinnedModel:
             joints=joints.float(),
             parents=self.parents,
             joint_names=self.joint_names,
-            vertex_labels=torch.tensor(own)[first],
+            vertex_labels=torch.tensor(joint_labels)[first],
             label_names=names,
             label_source="own" if parts == "joints" else "guess",
             template=self.v_template.float(),

@@ -108,7 +108,7 @@ class Solver(nn.Module):
     joints: Tensor  # [J, 3] rest
     # [N, 3] rest, 0 if not known: 33, and 3 of each hand of the free body
     landmarks: Tensor
-    known: Tensor  # [N] bool
+    has_place: Tensor  # [N] bool
     replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D, D] precisions
@@ -133,16 +133,16 @@ class Solver(nn.Module):
         self.parents = len(body.parents)
         self.joint_names = body.joint_names
         self.fingers = Fingers(body) if isinstance(body, Body) else None
-        known = body.landmarks.isfinite().all(-1)
+        has_place = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):
             body = _with_palms(body)
 
         # Constants of the steps: all of them follow from the body at rest.
-        own = body.landmarks[:BODY]
+        body_landmarks = body.landmarks[:BODY]
         with torch.no_grad():
             rig = self.rig = build_rig(body)
             rest, _ = sanitise(
-                torch.where(known[:, None], own, torch.nan)[None]
+                torch.where(has_place[:, None], body_landmarks, torch.nan)[None]
             )
 
             # A number turns about its axes; several turns may share a number.
@@ -159,7 +159,7 @@ class Solver(nn.Module):
 
             # The tensors that the steps read, by their names as buffers.
             held = {
-                "precision": known / _noise().square(),
+                "precision": has_place / _noise().square(),
                 "prior": precision,
                 "minimum": minimum,
                 "matrix": matrix.flatten(1),
@@ -171,7 +171,7 @@ class Solver(nn.Module):
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
                 "replaced": replaced,
-                "known": body.landmarks.isfinite().all(-1),
+                "has_place": body.landmarks.isfinite().all(-1),
             }
             for name, value in vars(rig).items():
                 if isinstance(value, Tensor):
@@ -241,8 +241,8 @@ class Solver(nn.Module):
 
             # They are the body's own palm where the hand was placed, so that
             # their errors agree.
-            own = self.landmarks[BODY:].unflatten(0, (2, -1))
-            at = own @ fingers.rotations.mT + fingers.shifts.unsqueeze(-2)
+            palm = self.landmarks[BODY:].unflatten(0, (2, -1))
+            at = palm @ fingers.rotations.mT + fingers.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
 
         # Frame by frame, in chunks.
@@ -312,33 +312,33 @@ class Solver(nn.Module):
     def _constants(self) -> dict[str, Tensor]:
         """The tensors that `compiled.CONSTANTS` names."""
         with torch.inference_mode(False), torch.no_grad():
-            own = {}
+            tensors = {}
             for name in compiled.RIG:
                 if hasattr(self, name):
-                    own[name] = getattr(self, name)
-            own["parent"] = self.rig.parent
+                    tensors[name] = getattr(self, name)
+            tensors["parent"] = self.rig.parent
 
             # Constants of the template, for the frames of trunk and head.
             template = constants(
                 MEDIAPIPE33, self.joints.device, self.joints.dtype
             )
-            own["head_from_eyes"] = template.head_from_eyes
-            own["torso"] = template.torso
-            own["head"] = template.head_points
+            tensors["head_from_eyes"] = template.head_from_eyes
+            tensors["torso"] = template.torso
+            tensors["head"] = template.head_points
 
             # The numbers of each joint that bends trunk and neck, and its share of the bend.
             names = (*SPINE, "neck")
             axes = [self._axes(name) / len(SPINE) for name in SPINE]
-            own["bend_numbers"] = torch.tensor(
+            tensors["bend_numbers"] = torch.tensor(
                 [self.rig.numbers(n) for n in names]
             )
-            own["bend_hub"] = torch.tensor([0] * len(SPINE) + [1])
-            own["bend_axes"] = torch.stack([*axes, self._axes("neck")])
+            tensors["bend_hub"] = torch.tensor([0] * len(SPINE) + [1])
+            tensors["bend_axes"] = torch.stack([*axes, self._axes("neck")])
 
             # One row per limb.
             for name in ("hub", "points", "numbers", "axes", "bend"):
                 values = [getattr(limb, name) for limb in self.rig.limbs]
-                own[f"limb_{name}"] = torch.stack(
+                tensors[f"limb_{name}"] = torch.stack(
                     list(map(torch.as_tensor, values))
                 )
 
@@ -347,8 +347,8 @@ class Solver(nn.Module):
                 buffers = dict(self.fingers.named_buffers())
                 buffers["rounds"] = torch.tensor(FINGER_ROUNDS)
                 for name in compiled.FINGERS:
-                    own[f"finger_{name}"] = buffers[name]
-            return compiled.to_constants(own)
+                    tensors[f"finger_{name}"] = buffers[name]
+            return compiled.to_constants(tensors)
 
     def _axes(self, name: str) -> Tensor:
         """``[3, 3]`` unit axes, by rows, of the numbers of a chain."""
@@ -388,7 +388,7 @@ class Solver(nn.Module):
 
         # The numbers that they show; the root's always.
         n = seen.shape[1]
-        seen = seen & self.known[:n]
+        seen = seen & self.has_place[:n]
         free = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
         free[:, :6] = True
 

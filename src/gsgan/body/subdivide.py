@@ -10,10 +10,10 @@ from torch import Tensor
 from gsgan.body.skinned import SkinnedBody
 from gsgan.utils.arrays import Ints
 
-B = TypeVar("B", bound=SkinnedBody)
+Skinned = TypeVar("Skinned", bound=SkinnedBody)
 
 
-def subdivide(body: B, count: int) -> B:
+def subdivide(body: Skinned, count: int) -> Skinned:
     """The body with ``count`` vertices, whose first ones are its own.
 
     The longest edges get a vertex in their middle, so that vertices spread more evenly. It has the
@@ -25,7 +25,7 @@ def subdivide(body: B, count: int) -> B:
     return body
 
 
-def _halve(body: B, maximum: int) -> B:
+def _halve(body: Skinned, maximum: int) -> Skinned:
     """The body with at most so many edges halved, the longest first."""
     # Every edge once, and the edges ab, bc and ca of each face.
     faces = body.faces.numpy()
@@ -77,9 +77,9 @@ def _split(faces: Ints, middles: Ints) -> Ints:
     parts = [faces[number == 0]]
 
     # All three edges: a triangle at each corner, and one between the middles.
-    own = number == 3
-    a, b, c = faces[own].T
-    ab, bc, ca = middles[own].T
+    whole = number == 3
+    a, b, c = faces[whole].T
+    ab, bc, ca = middles[whole].T
     for triangle in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
         parts.append(np.stack(triangle, axis=1))
 

@@ -20,7 +20,7 @@ from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED_IMAGES = "mirrored images"
-FULL = 0.98  # share of the image above which a mask is white everywhere
+FULL_MASK = 0.98  # share of the image above which a mask is white everywhere
 # Area of another piece of the mask over the person's, and share of a camera's images with one.
 OTHER_PIECE = 0.3
 OTHER_IMAGES = 0.1
@@ -95,9 +95,9 @@ def score_cameras(
 ) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
-    for name, own in group_by_camera(views).items():
+    for name, camera_views in group_by_camera(views).items():
         # Each rival's better variant, best rival first.
-        chosen = spread(own, TRIED)
+        chosen = spread(camera_views, TRIED)
         camera = subject.cameras[name]
         rivals = dict[str, float]()
         for rival, other in calibrations(camera, subject.cameras):
@@ -113,7 +113,7 @@ def score_cameras(
         inside = []
         outside = []
         fullness = []
-        for view in own:
+        for view in camera_views:
             fullness.append(view.fullness)
             if view.mask.any():
                 inside.append(view.inside)
@@ -128,9 +128,9 @@ def score_cameras(
                 rivals=dict(best_first),
                 outside=mean_of_known(outside),
                 inverted=_fit(subject, inverted, camera),
-                filled=float(np.median([view.filled for view in own])),
+                filled=float(np.median([view.filled for view in camera_views])),
                 others=float(
-                    np.mean([v.other_piece > OTHER_PIECE for v in own])
+                    np.mean([v.other_piece > OTHER_PIECE for v in camera_views])
                 ),
             )
         )
@@ -138,7 +138,7 @@ def score_cameras(
 
 
 def calibrations(
-    own: CameraEntry,
+    calibration: CameraEntry,
     cameras: Mapping[str, CameraEntry],
 ) -> Iterator[tuple[str, CameraEntry]]:
     """Other calibrations that a camera may have: mirrored, and those of other cameras.
@@ -146,13 +146,13 @@ def calibrations(
     Of another camera either R and t are exchanged, or the whole calibration.
     """
     # u becomes width - u.
-    mirror = own.K.copy()
+    mirror = calibration.K.copy()
     mirror[0] = -mirror[0]
-    mirror[0, 2] += own.size[1]
-    yield MIRRORED_IMAGES, replace(own, K=mirror)
+    mirror[0, 2] += calibration.size[1]
+    yield MIRRORED_IMAGES, replace(calibration, K=mirror)
     for name, other in cameras.items():
-        if name != own.name:
-            yield name, replace(own, R=other.R, t=other.t)
+        if name != calibration.name:
+            yield name, replace(calibration, R=other.R, t=other.t)
             yield name, other
 
 
@@ -177,8 +177,8 @@ def _fit(
 def mean_of_known(values: Sequence[float]) -> float:
     """The mean of the values that are not NaN; NaN if there are none."""
     array = np.array(values)
-    known = array[~np.isnan(array)]
-    return float(known.mean()) if len(known) else np.nan
+    finite = array[~np.isnan(array)]
+    return float(finite.mean()) if len(finite) else np.nan
 
 
 def calibration_findings(
@@ -262,7 +262,7 @@ def mask_findings(
 
     # White everywhere, or inverted.
     findings = []
-    full = [score.name for score in scores if score.filled > FULL]
+    full = [score.name for score in scores if score.filled > FULL_MASK]
     if full:
         text = f"masks are white everywhere ({list_names(full)}); {wrong}"
         findings.append(Finding("error", TOPIC, text))
@@ -368,12 +368,12 @@ def small_errors(
 
     # One camera is off much more than the others.
     findings = []
-    for name, own in metres.items():
+    for name, distance in metres.items():
         rest = [value for other, value in metres.items() if other != name]
         others = float(np.median(rest)) if rest else np.inf
-        if own > max(limits.outside, OUTSIDE_RATIO * others):
+        if distance > max(limits.outside, OUTSIDE_RATIO * others):
             text = (
-                f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
+                f"camera {name}: joints lie {100 * distance:.1f} cm outside its masks on average, "
                 f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly off"
             )
             findings.append(Finding("warning", TOPIC, text))

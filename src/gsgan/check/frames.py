@@ -44,7 +44,7 @@ MAX_BACKWARDS = 0.5
 # The names of landmarks count as those of this many cameras.
 SURE_LABELS = 2.0
 USUAL_RATE = 30.0  # frames per second of a capture that does not state it
-PARTS = ("head", "arms", "legs")  # of `FLIP_GROUPS`
+DOUBTED_PARTS = ("head", "arms", "legs")  # of `FLIP_GROUPS`
 
 
 @dataclass(frozen=True)
@@ -176,28 +176,28 @@ def mask_doubts(
     unfit: Collection[str] = (),
 ) -> Iterable[Doubt]:
     """Reasons to doubt masks, without the cameras ``unfit``, whose masks fit in no frame."""
-    for name, own in group_by_camera(views).items():
+    for name, camera_views in group_by_camera(views).items():
         if name in unfit:
             continue
 
         # The usual area of this camera's masks, relative to the body's.
-        areas = [view.fullness for view in own if view.mask.any()]
+        areas = [view.fullness for view in camera_views if view.mask.any()]
         usual = float(np.median(areas)) if areas else 0.0
-        for view in own:
+        for view in camera_views:
             if not view.mask.any():
                 yield Doubt(view.frame, "mask", f"{name}: the mask is empty")
                 continue
 
             # Joints outside of the mask.
-            known = int(view.known.sum())
+            joints = int(view.has_joint.sum())
             out = int(view.beyond.sum())
-            if known and out / known > limits.frame_outside:
-                text = f"{name}: {out} of {known} joints outside the mask"
+            if joints and out / joints > limits.frame_outside:
+                text = f"{name}: {out} of {joints} joints outside the mask"
                 yield Doubt(view.frame, "outside", text)
 
             # With few joints the estimated silhouette is too incomplete to compare the mask with.
             change = view.fullness / usual - 1 if usual else 0.0
-            enough = known >= limits.seen_share * len(view.known)
+            enough = joints >= limits.seen_share * len(view.has_joint)
             if enough and abs(change) > limits.area_jump:
                 text = f"{name}: mask area {change:+.0%} off the usual for the pose"
                 yield Doubt(view.frame, "mask", text)
@@ -205,14 +205,14 @@ def mask_doubts(
 
 def frame_findings(
     subject: CheckedData,
-    found: Sequence[Doubt],
+    doubts: Sequence[Doubt],
     limits: Limits,
 ) -> list[Finding]:
     """One finding per kind of doubt; an error if left and right, or most frames, are wrong."""
     findings = []
     count = len(subject.frames)
     by_kind: dict[str, list[Doubt]] = {}
-    for doubt in found:
+    for doubt in doubts:
         by_kind.setdefault(doubt.kind, []).append(doubt)
 
     # Most frames face backwards: one error in place of many warnings.
@@ -228,7 +228,7 @@ def frame_findings(
     # Left and right exchanged for a time: an error with the frames of each part.
     if not mirrored:
         wrong = find_exchanges(subject)
-        for part, flags in zip(PARTS, wrong.T, strict=True):
+        for part, flags in zip(DOUBTED_PARTS, wrong.T, strict=True):
             frames = subject.frames[flags].tolist()
             if frames:
                 text = (
@@ -250,7 +250,7 @@ def frame_findings(
             findings.append(Finding("warning", "frames", text))
 
     # Most frames are doubtful for any reason.
-    share = len({doubt.frame for doubt in found}) / count
+    share = len({doubt.frame for doubt in doubts}) / count
     if share > limits.doubtful and not mirrored:
         text = f"{share:.0%} of the frames are doubtful; training on them is not worth its time"
         findings.append(Finding("error", "frames", text))
@@ -282,12 +282,12 @@ def find_jumps(distance: Float, limit: float) -> Bool:
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
     # A row of zeros before and after: the first and last frame have one neighbour.
-    known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
+    padded = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
 
     # A tie counts as a peak: two equal jumps are both named.
-    before = known[:-2]
-    here = known[1:-1]
-    after = known[2:]
+    before = padded[:-2]
+    here = padded[1:-1]
+    after = padded[2:]
     peak = (here >= before) & (here >= after)
     return (here > limit) & peak
 
@@ -314,6 +314,6 @@ def facing(p: Float, template: SkeletonTemplate) -> Float:
 
     # The mean of the known votes.
     votes = np.sign((np.stack(ahead) * front).sum(-1))  # [3, F]
-    known = np.isfinite(votes)
-    votes = np.where(known, votes, 0.0).sum(0) / known.sum(0).clip(1)
-    return np.where(known.any(0), votes, np.nan)
+    has_vote = np.isfinite(votes)
+    votes = np.where(has_vote, votes, 0.0).sum(0) / has_vote.sum(0).clip(1)
+    return np.where(has_vote.any(0), votes, np.nan)

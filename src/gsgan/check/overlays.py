@@ -46,9 +46,9 @@ def strip(
     tiles = []
     for view in views:
         # The caption counts the joints inside the mask.
-        known = int(view.known.sum())
+        joints = int(view.has_joint.sum())
         out = int(view.beyond.sum())
-        text = f"{view.frame}   {known - out}/{known} inside"
+        text = f"{view.frame}   {joints - out}/{joints} inside"
         colour = OUTSIDE_COLOUR if view.frame in doubtful else CAPTION_COLOUR
         captioned = caption(tile(subject, view), text, colour)
         tiles.append(captioned)

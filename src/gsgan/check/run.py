@@ -18,7 +18,7 @@ from gsgan.check.settings import Limits, Sampling
 from gsgan.data.formats.capture import CaptureReader, capture_problems
 from gsgan.effects import EffectSettings
 from gsgan.utils.checks import one_of
-from gsgan.utils.config import FAILED, CommandOptions, build
+from gsgan.utils.config import FAILED, CommandOptions, build, defaults_of
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically, write_json, writing
@@ -31,7 +31,7 @@ def check_data(
     data: GsganData,
     sampling: Sampling,
     limits: Limits,
-    effects: EffectSettings | None = None,
+    effects: EffectSettings,
     console: Console | None = None,
 ) -> CheckReport:
     """Checks a dataset.
@@ -40,7 +40,7 @@ def check_data(
         data: it need not have been read yet.
         sampling: how much is checked.
         limits: thresholds.
-        effects: settings of the effects as for training; None: the defaults.
+        effects: settings of the effects as for training.
         console: shows the progress.
 
     Returns:
@@ -51,13 +51,7 @@ def check_data(
     """
     # A dataset that cannot be read has a report, too.
     try:
-        measured = Measurements(
-            data,
-            sampling,
-            limits,
-            effects or EffectSettings(),
-            console,
-        )
+        measured = Measurements(data, sampling, limits, effects, console)
     except DataError as error:
         # The reader stops at the first problem; captures are searched for all.
         messages = [str(error)]
@@ -89,7 +83,14 @@ def check_capture(root: Path, path: Path, console: Console) -> CheckReport:
     from gsgan.data.datamodule import GsganData
 
     data = GsganData(root=str(root), reader=CaptureReader())
-    report = check_data(data, Sampling(), Limits(), console=console)
+    defaults = defaults_of("check")
+    report = check_data(
+        data,
+        sampling=build(defaults.sampling),
+        limits=build(defaults.limits),
+        effects=build(defaults_of("effects/auto")),
+        console=console,
+    )
     write_report(report, path, console)
     return report
 

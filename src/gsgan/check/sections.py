@@ -281,8 +281,8 @@ def sections(m: Measurements) -> Sequence[Section]:
 
     # One strip of images per camera.
     strips = []
-    for name, own in views.group_by_camera(m.views).items():
-        shown = spread(own, m.sampling.shown)
+    for name, camera_views in views.group_by_camera(m.views).items():
+        shown = spread(camera_views, m.sampling.shown)
         image = overlays.strip(m.subject, shown, m.reasons)
         strips.append(Figure(f"camera {name}", image))
     return (

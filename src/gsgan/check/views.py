@@ -152,7 +152,7 @@ class MaskView:
         return replace(camera, K=self.to_small @ camera.K, size=self.mask.shape)
 
     @property
-    def known(self) -> Bool:
+    def has_joint(self) -> Bool:
         """``[J]`` joints that are visible and lie in the image."""
         return ~np.isnan(self.outside)
 
@@ -164,14 +164,14 @@ class MaskView:
     @property
     def distance(self) -> float:
         """Metres, mean distance of the known joints from the mask; NaN without any."""
-        metres = np.minimum(self.outside[self.known], MAX_OUTSIDE)
+        metres = np.minimum(self.outside[self.has_joint], MAX_OUTSIDE)
         return float(metres.mean()) if len(metres) else np.nan
 
     @property
     def inside(self) -> float:
         """Share of the known joints inside the mask, within the tolerance; NaN without any."""
-        known = self.known.sum()
-        return 1 - self.beyond.sum() / known if known else np.nan
+        joints = self.has_joint.sum()
+        return 1 - self.beyond.sum() / joints if joints else np.nan
 
 
 def group_by_camera(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
@@ -319,8 +319,12 @@ def other_piece(mask: Bool, body: Bool) -> float:
     touching = np.zeros(count, bool)
     touching[np.unique(labels[body])] = True
     areas[0] = 0  # the background
-    own = areas[touching].sum()
-    return float(areas[~touching].max(initial=0) / own) if own else 0.0
+    touching_area = areas[touching].sum()
+    return (
+        float(areas[~touching].max(initial=0) / touching_area)
+        if touching_area
+        else 0.0
+    )
 
 
 def body_silhouette(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry, Crop
 from gsgan.scene import NEAR
 from gsgan.utils.arrays import Bytes, Float
-from gsgan.utils.checks import above
+from gsgan.utils.checks import positive
 
 # of x/z: maximum error of an undistorted point
 FOUND = 1e-8
@@ -62,7 +62,7 @@ class PersonCrop:
     margin: float = 0.2
 
     def __post_init__(self) -> None:
-        above("data.crop.margin", self.margin)
+        positive("data.crop.margin", self.margin)
 
     def window(
         self,

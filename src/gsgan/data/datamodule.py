@@ -44,7 +44,7 @@ from gsgan.scene import Frame, cat
 from gsgan.skeleton import TEMPLATES, template_of
 from gsgan.skeleton.template import Vector
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import at_least, one_of, whole
+from gsgan.utils.checks import at_least, integer, one_of
 from gsgan.utils.errors import ConfigError
 
 __all__ = [
@@ -153,7 +153,7 @@ class GsganData(LightningDataModule):
         self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
         self.protocol = protocol
         self.split_keys = split_keys
-        whole("data.min_joints", min_joints, 1)
+        integer("data.min_joints", min_joints, 1)
         self.limits = replace(Thresholds(), min_joints=min_joints)
 
         # The form of images.
@@ -162,17 +162,17 @@ class GsganData(LightningDataModule):
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
         # Batches, and the processes that load them.
-        self.batch_size = whole("data.batch_size", batch_size, 1)
+        self.batch_size = integer("data.batch_size", batch_size, 1)
         if steps_per_epoch is not None:
-            whole("data.steps_per_epoch", steps_per_epoch, 1)
+            integer("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
-        self.val_images = whole("data.val_images", val_images, 1)
+        self.val_images = integer("data.val_images", val_images, 1)
         if workers is None:
             workers = default_workers()
-        self.workers = whole("data.workers", workers, 0)
-        self.seed = whole("data.seed", seed, 0)
+        self.workers = integer("data.workers", workers, 0)
+        self.seed = integer("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
-        self.info_samples = whole("data.info_samples", info_samples, 1)
+        self.info_samples = integer("data.info_samples", info_samples, 1)
 
     def read(self) -> Self:
         """Makes the dataset if need be, reads and checks it."""

@@ -24,7 +24,7 @@ from gsgan.data.skeletons import Landmarks
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame, unit
 from gsgan.utils.arrays import Bytes
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.errors import DataError
 from gsgan.utils.image_files import read_colour
 
@@ -39,13 +39,13 @@ class DecodedImage:
         image: ``[3, H, W]`` RGB on black.
         mask: ``[H, W]`` 0..255.
         labels: ``[H, W]`` part numbers, or None.
-        unsure: ``[H, W]`` 255 where colours are left out of the loss, or None.
+        ignored: ``[H, W]`` 255 where colours are left out of the loss, or None.
     """
 
     image: Bytes
     mask: Bytes
     labels: Bytes | None
-    unsure: Bytes | None = None
+    ignored: Bytes | None = None
 
 
 class ImageCache(LRUCache[Item, DecodedImage]):
@@ -54,7 +54,7 @@ class ImageCache(LRUCache[Item, DecodedImage]):
     @staticmethod
     def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
-        parts = (value.image, value.mask, value.labels, value.unsure)
+        parts = (value.image, value.mask, value.labels, value.ignored)
         # A part that the capture lacks is None.
         return sum(part.nbytes for part in parts if part is not None)
 
@@ -67,7 +67,7 @@ class CaptureDataset(Dataset[Frame]):
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
     undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
     camera alone. Labels keep 255 as "ignore". Where the person's mask reaches the border of the
-    stored image, the person goes on beyond it: pixels beyond it are unsure, and their labels 255.
+    stored image, the person goes on beyond it: pixels beyond it are ignored, and their labels 255.
 
     Args:
         layout: the capture.
@@ -104,7 +104,7 @@ class CaptureDataset(Dataset[Frame]):
         self.layout = layout
         self.ignore_band = ignore_band
         self.items = items
-        self.size = None if size is None else whole("data.size", size, 1)
+        self.size = None if size is None else integer("data.size", size, 1)
         self.crop = crop
         self.lens = lens
         self.cache = ImageCache(0) if cache is None else cache
@@ -136,9 +136,9 @@ class CaptureDataset(Dataset[Frame]):
         labels = None
         if decoded.labels is not None:
             labels = torch.from_numpy(decoded.labels)[None]
-        unsure = None
-        if decoded.unsure is not None:
-            unsure = torch.from_numpy(decoded.unsure)[None, None]
+        ignored = None
+        if decoded.ignored is not None:
+            ignored = torch.from_numpy(decoded.ignored)[None, None]
         body = None
         poses = self.layout.poses
         if poses is not None:
@@ -147,7 +147,7 @@ class CaptureDataset(Dataset[Frame]):
             )
 
         # Every part has a batch dimension of 1; bytes become floats only on request.
-        found = Frame(
+        frame_data = Frame(
             image=torch.from_numpy(decoded.image)[None],
             mask=torch.from_numpy(decoded.mask)[None, None],
             camera=self.camera(item),
@@ -157,12 +157,12 @@ class CaptureDataset(Dataset[Frame]):
             camera_index=torch.tensor([self._indices[name]]),
             body=body,
             labels=labels,
-            unsure=unsure,
+            ignored=ignored,
         )
-        return found if self.packed else found.unpack()
+        return frame_data if self.packed else frame_data.unpack()
 
     def mask(self, index: int) -> tuple[Bytes, Bytes | None]:
-        """The mask ``[H, W]`` of an item and its unsure pixels, 0..255; reads no image.
+        """The mask ``[H, W]`` of an item and its ignored pixels, 0..255; reads no image.
 
         Raises:
             DataError: when the mask's file is damaged, naming the file.
@@ -170,11 +170,11 @@ class CaptureDataset(Dataset[Frame]):
         # Resampled as `_load` does.
         item = self.items[index]
         fit = self._fitting(item)
-        mask, unsure = self._read_mask(item)
+        mask, ignored = self._read_mask(item)
         mask = fit(mask, self.layout.pixels.mask_sampling == "nearest")
-        if unsure is not None:
-            unsure = fit(unsure, True)
-        return mask, unsure
+        if ignored is not None:
+            ignored = fit(ignored, True)
+        return mask, ignored
 
     def inside(self, item: Item) -> Tensor | None:
         """``[1, 1, H, W]`` 1 at pixels of the item that lie in the stored image; None if all do.
@@ -253,7 +253,7 @@ class CaptureDataset(Dataset[Frame]):
         fit = self._fitting(item)
 
         # Mask and image as stored.
-        mask, unsure = self._read_mask(item)
+        mask, ignored = self._read_mask(item)
         image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
 
@@ -270,36 +270,36 @@ class CaptureDataset(Dataset[Frame]):
                 )
             labels = fit(labels, True)
 
-        # The mask is resampled last: labels and unsure pixels refer to its
+        # The mask is resampled last: labels and ignored pixels refer to its
         # stored outline.
-        if unsure is not None:
-            unsure = fit(unsure, True)
+        if ignored is not None:
+            ignored = fit(ignored, True)
         goes_on = touches_border(mask)
         mask = fit(mask, rules.mask_sampling == "nearest")
 
         # What no pixel shows of a person who goes on beyond the border is unknown. All items of a
-        # dataset have unsure pixels, or none, so that they form batches.
+        # dataset have ignored pixels, or none, so that they form batches.
         if self.padded:
             beyond = np.zeros_like(mask)
             if goes_on:
                 beyond = 255 - self._stored_pixels(item)
-            unsure = beyond if unsure is None else np.maximum(unsure, beyond)
+            ignored = beyond if ignored is None else np.maximum(ignored, beyond)
             if labels is not None:
                 labels[beyond > 0] = IGNORE_LABEL
 
         # Channels first, as networks take them.
         chw = np.ascontiguousarray(image.transpose(2, 0, 1))
-        return DecodedImage(chw, mask, labels, unsure)
+        return DecodedImage(chw, mask, labels, ignored)
 
     def _read_mask(self, item: Item) -> tuple[Bytes, Bytes | None]:
-        """The mask of an item and its unsure pixels, as stored."""
+        """The mask of an item and its ignored pixels, as stored."""
         # Several files may make one mask; its size is checked once they are joined.
         rules = self.layout.pixels
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
-        unsure = pixels.read_unsure(mask_files, mask, rules)
+        ignored = pixels.read_ignored(mask_files, mask, rules)
         self._check_size(self.layout.mask_path(*item), mask, self._entry(item))
-        return mask, unsure
+        return mask, ignored
 
     def _fitting(self, item: Item) -> Callable[[Bytes, bool], Bytes]:
         """Undistorts a stored image, cuts it to the item's window and resizes it.

@@ -74,7 +74,7 @@ class Meta:
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
-    """The parts that `Found` and `Layout` share. Paths are relative to the root.
+    """The parts that `DatasetFiles` and `Layout` share. Paths are relative to the root.
 
     Args:
         root: the dataset's folder.
@@ -106,7 +106,7 @@ class _Contents:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found(_Contents):
+class DatasetFiles(_Contents):
     """The files that a reader found; they are not yet checked against each other.
 
     Args:
@@ -178,25 +178,25 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     return folder
 
 
-def assemble(found: Found, limits: Thresholds) -> Layout:
+def assemble(contents: DatasetFiles, limits: Thresholds) -> Layout:
     """Checks the files against each other and leaves out those that cannot be used.
 
     Raises:
         DataError: for whatever is missing or contradictory, naming the file.
     """
     # Notes of the reader come before those of the checks.
-    root = found.root
-    cameras = found.cameras
-    landmarks = found.landmarks
-    calibration = found.calibration
-    masks = {frame for files in found.masks.values() for frame in files}
+    root = contents.root
+    cameras = contents.cameras
+    landmarks = contents.landmarks
+    calibration = contents.calibration
+    masks = {frame for files in contents.masks.values() for frame in files}
     others = {"masks": masks, "landmarks": landmarks.p}
-    shifted = find_shifts(frames_of(found.images), others)
+    shifted = find_shifts(frames_of(contents.images), others)
     if not shifted:
-        for name, files in found.images.items():
-            own = {"masks": found.masks.get(name, {})}
-            shifted += find_shifts(files, own, f"images of {name}")
-    notes = [*found.notes, *shifted]
+        for name, files in contents.images.items():
+            mask_files = {"masks": contents.masks.get(name, {})}
+            shifted += find_shifts(files, mask_files, f"images of {name}")
+    notes = [*contents.notes, *shifted]
     cause = None
     if shifted:
         cause = f"{root}: {shifted[0].removeprefix('doubtful: ')}"
@@ -204,24 +204,30 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     # Frames need a skeleton, and cameras must fit the skeletons.
     with explain(cause):
         images = drop_frames(
-            root, found.images, landmarks, found.poses, limits, notes
+            root, contents.images, landmarks, contents.poses, limits, notes
         )
     check_geometry(
-        root, cameras, images, landmarks, limits, calibration, found.unit_hint
+        root,
+        cameras,
+        images,
+        landmarks,
+        limits,
+        calibration,
+        contents.unit_hint,
     )
 
     # Images must show the person and have a mask.
     images = drop_unseen(cameras, images, landmarks, limits, calibration, notes)
     folders = {}
     for name in cameras:
-        folders[name] = root / found.mask_folder.format(camera=name)
+        folders[name] = root / contents.mask_folder.format(camera=name)
     with explain(cause):
-        images = drop_unmasked(images, found.masks, folders, limits, notes)
+        images = drop_unmasked(images, contents.masks, folders, limits, notes)
 
     # Labels of the images that are left; none at all is the same as a capture without labels.
     labels = {}
     for name, files in images.items():
-        stored = found.labels.get(name, {})
+        stored = contents.labels.get(name, {})
         labels[name] = {f: path for f, path in stored.items() if f in files}
     if not any(labels.values()):
         labels = {}
@@ -231,13 +237,13 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
         root,
         cameras,
         images,
-        found.masks,
+        contents.masks,
         labels,
         stride=limits.header_stride,
         calibration=calibration,
     )
 
     # All other fields stay as the reader found them.
-    kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
+    kept = {one.name: getattr(contents, one.name) for one in fields(_Contents)}
     kept |= {"images": images, "labels": labels, "notes": tuple(notes)}
     return Layout(**kept, frames=tuple(frames_of(images)))

@@ -61,8 +61,8 @@ class PixelRules:
         label_table: 256 part numbers, one per stored label; None keeps the labels.
         ignore_band: pixels of the stored image, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
-        unsure_band: the same for colours: pixels in that band are left out of the loss.
-        unsure_alpha: pixels of an alpha strictly between these two are too; None leaves out none.
+        ignored_band: the same for colours: pixels in that band are left out of the loss.
+        ignored_alpha: pixels of an alpha strictly between these two are too; None leaves out none.
     """
 
     composed: bool = False
@@ -70,8 +70,8 @@ class PixelRules:
     mask_sampling: Literal["linear", "nearest"] = "linear"
     label_table: tuple[int, ...] | None = None
     ignore_band: int = 0
-    unsure_band: int = 0
-    unsure_alpha: tuple[int, int] | None = None
+    ignored_band: int = 0
+    ignored_alpha: tuple[int, int] | None = None
 
 
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
@@ -217,7 +217,7 @@ def outline(mask: Bytes, band: int) -> Bool:
     return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
 
 
-def read_unsure(
+def read_ignored(
     files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules
 ) -> Bytes | None:
     """``[H, W]`` 255 at pixels that are left out of the loss, or None without such a rule.
@@ -228,13 +228,13 @@ def read_unsure(
         rules: of the dataset.
     """
     # Without a rule all pixels count.
-    if rules.unsure_band == 0 and rules.unsure_alpha is None:
+    if rules.ignored_band == 0 and rules.ignored_alpha is None:
         return None
     # The band at the outline, and pixels of uncertain alpha.
-    unsure = outline(mask, rules.unsure_band)
-    if rules.unsure_alpha is not None:
-        low, high = rules.unsure_alpha
+    ignored = outline(mask, rules.ignored_band)
+    if rules.ignored_alpha is not None:
+        low, high = rules.ignored_alpha
         for _, path in files:
             alpha = read_mask_values(path)
-            unsure |= (alpha > low) & (alpha < high)
-    return np.where(unsure, np.uint8(255), np.uint8(0))
+            ignored |= (alpha > low) & (alpha < high)
+    return np.where(ignored, np.uint8(255), np.uint8(0))

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.utils.checks import above, between
+from gsgan.utils.checks import between, positive
 from gsgan.utils.errors import ConfigError
 
 
@@ -50,7 +50,7 @@ class Protocol:
 
     def __post_init__(self) -> None:
         # Above 0 and at most 1.
-        between("protocol.scale", above("protocol.scale", self.scale), 0, 1)
+        between("protocol.scale", positive("protocol.scale", self.scale), 0, 1)
         if self.train_cameras is None and self.test_cameras is None:
             raise ConfigError(
                 "protocol.train_cameras and protocol.test_cameras are both null; name one of them"

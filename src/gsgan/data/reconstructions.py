@@ -65,7 +65,7 @@ DAMAGE = (ArithmeticError, LookupError, OSError, struct.error, ValueError)
 OPENGL = np.diag([1.0, -1.0, -1.0])
 # A camera stands still if the poses of its images differ by less: degrees, and a share of the
 # distance of the cameras from their middle.
-MAX_TURN = 2.0
+MAX_FRAME_TURN = 2.0
 MAX_MOVE = 0.05
 
 
@@ -233,7 +233,7 @@ def _one_pose(
     # The largest deviation tells a camera that moves.
     turned = np.degrees((rotations * mean.inv()).magnitude().max())
     moved = np.linalg.norm(centres - centre, axis=1).max()
-    if turned > MAX_TURN or moved > MAX_MOVE * extent:
+    if turned > MAX_FRAME_TURN or moved > MAX_MOVE * extent:
         raise DataError(
             f"{where} moves between its {len(group)} images; cameras must stand still, each with a "
             "folder or an image of its own"

@@ -210,8 +210,10 @@ def count_labels(layout: Layout, items: Sequence[Item]) -> int:
         path = layout.label_path(*item)
         if path:
             labels = read_labels(path, layout.pixels, None)
-            own = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
-            highest = max(highest, own)
+            image_highest = int(
+                labels.max(where=labels != IGNORE_LABEL, initial=0)
+            )
+            highest = max(highest, image_highest)
     return highest + 1
 
 
@@ -263,9 +265,9 @@ def _sample(dataset: CaptureDataset, samples: int) -> list[list[int]]:
 
     # From the first to the last, in even steps.
     sampled = []
-    for own in by_camera.values():
-        places = evenly_spaced(len(own), samples, ends=True)
-        sampled.append([own[place] for place in places])
+    for items in by_camera.values():
+        places = evenly_spaced(len(items), samples, ends=True)
+        sampled.append([items[place] for place in places])
     return sampled
 
 

@@ -72,9 +72,9 @@ class Landmarks:
         unseen = np.zeros(joints)
         p = {}
         visibility = {}
-        for frame, own in self.p.items():
+        for frame, joint_places in self.p.items():
             added = part.p.get(frame, nothing)
-            p[frame] = np.concatenate([own, added])
+            p[frame] = np.concatenate([joint_places, added])
             seen = part.visibility.get(frame, unseen)
             visibility[frame] = np.concatenate([self.visibility[frame], seen])
         return Landmarks(p, visibility, self.source)
@@ -222,16 +222,16 @@ def fill_missing(
     means = filled.sum(1) / count  # [F, 3]
     for joint in range(p.shape[1]):
         # Rows of the frames that have this joint, and of those that lack it.
-        known = np.flatnonzero(valid[:, joint])
+        present = np.flatnonzero(valid[:, joint])
         holes = np.flatnonzero(~valid[:, joint])
-        if len(known) == 0:
+        if len(present) == 0:
             filled[:, joint] = means
             continue
 
         # The known frames before and after each hole, in rows.
-        place = np.searchsorted(known, holes)
-        after = known[place.clip(0, len(known) - 1)]
-        before = known[(place - 1).clip(0)]
+        place = np.searchsorted(present, holes)
+        after = present[place.clip(0, len(present) - 1)]
+        before = present[(place - 1).clip(0)]
 
         # The nearer of the two, in frame numbers.
         back = np.abs(ids[holes] - ids[before])

@@ -13,7 +13,7 @@ from gsgan.data.skeletons import Landmarks
 from gsgan.data.validation import spans
 from gsgan.skeleton.training_poses import pose_in_pelvis, training_poses
 from gsgan.utils.arrays import Ints, evenly_spaced
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import AUTO, integer
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.frame_files import LARGEST_FRAME
 from gsgan.utils.tensors import farthest_points
@@ -33,7 +33,6 @@ SPLITS = ("train", "novel_view", "novel_pose")
 # a further split, of frames cut from the training frames, where it is asked for
 VALIDATION = "validation"
 # what cuts the last share of the training frames
-AUTO = "auto"
 VALIDATION_SHARE = 0.1
 # camera name, frame number
 Item = tuple[str, int]
@@ -198,7 +197,7 @@ def make_splits(
         left = set(usable.train).difference(validation)
         usable = usable._replace(train=tuple(sorted(left)))
     if train_poses is not None:
-        maximum = whole("data.train_poses", train_poses, 1)
+        maximum = integer("data.train_poses", train_poses, 1)
         spread = spread_frames(layout.landmarks, usable.train, maximum)
         usable = usable._replace(train=tuple(spread))
     items = {
@@ -263,14 +262,16 @@ def spread_items(items: Sequence[Item], count: int) -> list[int]:
         by_frame.setdefault(frame, []).append(place)
     turned = []
     for i, frame in enumerate(sorted(by_frame)):
-        own = by_frame[frame]
-        first = i % len(own)
-        turned.append(own[first:] + own[:first])
+        frame_items = by_frame[frame]
+        first = i % len(frame_items)
+        turned.append(frame_items[first:] + frame_items[:first])
 
     # Rounds over all frames; the last one takes some of them, evenly spaced.
     chosen: list[int] = []
     for nth in range(max(map(len, turned), default=0)):
-        places = [own[nth] for own in turned if nth < len(own)]
+        places = [
+            frame_items[nth] for frame_items in turned if nth < len(frame_items)
+        ]
         left = min(count - len(chosen), len(places))
         if left > 0:
             chosen += [places[i] for i in evenly_spaced(len(places), left)]
@@ -282,12 +283,12 @@ def _usable(
 ) -> tuple[Sides[int], tuple[str, ...]]:
     """The train and test frames that the capture has, and a note on the others."""
     # Frames that were dropped, or never existed.
-    known = set(layout.frames)
+    available = set(layout.frames)
     usable = Sides(
-        train=tuple(frame for frame in frames.train if frame in known),
-        test=tuple(frame for frame in frames.test if frame in known),
+        train=tuple(frame for frame in frames.train if frame in available),
+        test=tuple(frame for frame in frames.test if frame in available),
     )
-    missing = sorted({*frames.train, *frames.test} - known)
+    missing = sorted({*frames.train, *frames.test} - available)
     if not missing:
         return usable, ()
     note = f"{len(missing)} frames {whose} are not usable or do not exist: {spans(missing)}"

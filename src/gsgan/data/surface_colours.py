@@ -33,7 +33,7 @@ WIDEST = 4.0
 # metres: accuracy of the surface, over which colours are averaged
 BLUR = 0.03
 # share of the blur in the mask: outlines mix with the background
-WHOLE = 0.95
+WHOLE_SHARE = 0.95
 # minimum number that two cameras share in a frame: fewer lie at outlines, at grazing angles
 MIN_SHARED = 30
 # minimum number of such frames
@@ -211,9 +211,9 @@ def _colours(frame: Frame, points: Float) -> Float:
     rows = pixels[front, 1]
     columns = pixels[front, 0]
     weight = soft[rows, columns]
-    colours = image[rows, columns] / np.maximum(weight, WHOLE)[:, None]
+    colours = image[rows, columns] / np.maximum(weight, WHOLE_SHARE)[:, None]
 
     # Points near the mask's outline do not count.
-    colours[weight < WHOLE] = np.nan
+    colours[weight < WHOLE_SHARE] = np.nan
     result[front] = colours
     return result

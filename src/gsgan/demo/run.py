@@ -11,12 +11,12 @@ from gsgan.render.run import RenderOptions, render
 from gsgan.run.drive import MotionOptions, drive_of
 from gsgan.run.runs import Run
 from gsgan.run.shared import DEMO_FOLDER, DEMO_MOTION
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.config import CommandOptions, with_defaults
 from gsgan.utils.console import make_console
 from gsgan.utils.files import write_atomically, writing
 
-FPS = 25  # of the dance
+DANCE_FPS = 25  # of the dance
 PICTURE = 14  # the frame that the picture shows
 
 
@@ -39,14 +39,14 @@ def demo(options: DemoOptions) -> None:
     """
     # Without an encoder the video is a folder of PNG files.
     out = Path(options.out).expanduser()
-    pixels = whole("pixels", options.pixels, 16)
+    pixels = integer("pixels", options.pixels, 16)
     video = out / ("dance.mp4" if find_spec("av") else "dance")
     given = {
         "run": str(DEMO_FOLDER),
         "motion": str(DEMO_MOTION),
         "out": str(video),
         "overwrite": options.overwrite,
-        "fps": FPS,
+        "fps": DANCE_FPS,
         "frames": options.frames,
         "pixels": pixels,
         "background": "white",
@@ -56,7 +56,7 @@ def demo(options: DemoOptions) -> None:
     # The picture shows one pose of the dance from the front.
     run = Run.load(DEMO_FOLDER)
     motion = MotionOptions(motion=str(DEMO_MOTION))
-    drive = drive_of(motion, run, FPS)
+    drive = drive_of(motion, run, DANCE_FPS)
     picture = out / "picture.png"
     content = preview(run, drive.rows(np.array([PICTURE])), pixels)
     with writing(picture):

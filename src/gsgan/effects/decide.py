@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gsgan.effects.record import OFF, Effect, Effects
-from gsgan.utils.checks import is_number, one_of
+from gsgan.utils.checks import AUTO, is_number, one_of
 from gsgan.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo
 
-AUTO = "auto"
 ON_OFF = (AUTO, "on", "off")
 # Values that each effect may be set to.
 CHOICES: dict[str, tuple[str | int, ...]] = {
@@ -48,31 +47,31 @@ class EffectSettings:
     """
 
     # The requested values.
-    view_dependence: str | int | bool = AUTO
-    distortion: str | bool = AUTO
-    antialias: str | bool = AUTO
-    colour_correction: str | bool = AUTO
-    body_points: str | bool = AUTO
-    random_background: str | bool = AUTO
-    registration: str | bool = AUTO
-    light: str | bool = AUTO
+    view_dependence: str | int | bool
+    distortion: str | bool
+    antialias: str | bool
+    colour_correction: str | bool
+    body_points: str | bool
+    random_background: str | bool
+    registration: str | bool
+    light: str | bool
 
     # Restrictions of all of them, and what happens to a forced effect that is not possible.
-    only: Sequence[str] | None = None
-    impossible: str | bool = "error"
+    only: Sequence[str] | None
+    impossible: str | bool
 
     # Thresholds of ``auto``.
-    view_residual: float = 0.09
-    rendered_scales: Sequence[float] = (1.0, 1.0)
-    degree_cameras: Sequence[int] = (2, 4, 8)
-    colour_difference: float = 0.03
-    colour_share: float = 0.5
-    scale_ratio: float = 1.3
-    dark: float = 0.25
-    body_inside: float = 0.95
-    texture: float = 0.6
-    pixels_per_metre: float = 150.0
-    degrees_seen: float = 300.0
+    view_residual: float
+    rendered_scales: Sequence[float]
+    degree_cameras: Sequence[int]
+    colour_difference: float
+    colour_share: float
+    scale_ratio: float
+    dark: float
+    body_inside: float
+    texture: float
+    pixels_per_metre: float
+    degrees_seen: float
 
     def __post_init__(self) -> None:
         # Each requested value is one of the effect's.

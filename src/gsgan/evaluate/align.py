@@ -13,9 +13,9 @@ from gsgan.scene import BodyPose, Frame
 from gsgan.utils.errors import ConfigError
 
 # Steps of Adam for each image, and its settings; the rate, in radians, falls to 0 linearly.
-STEPS = 30
+ALIGN_STEPS = 30
 RATE = 0.01
-BETAS = (0.9, 0.9)
+ALIGN_BETAS = (0.9, 0.9)
 # metres of the root's move for each radian of a joint's turn
 METRES_PER_RADIAN = 0.375
 
@@ -58,9 +58,9 @@ def align_poses(
     seen = frame if window is None else window.frame(frame)
     moves = start.theta.new_zeros(len(frame), len(scale), 3)
     moves.requires_grad_()
-    optimiser = torch.optim.Adam([moves], lr=RATE, betas=BETAS)
-    for step in range(STEPS):
-        optimiser.param_groups[0]["lr"] = RATE * (1 - step / STEPS)
+    optimiser = torch.optim.Adam([moves], lr=RATE, betas=ALIGN_BETAS)
+    for step in range(ALIGN_STEPS):
+        optimiser.param_groups[0]["lr"] = RATE * (1 - step / ALIGN_STEPS)
         rendering = avatar(
             seen.skeleton,
             seen.visibility,
@@ -83,5 +83,5 @@ def _difference(rendering: Rendering, frame: Frame) -> Tensor:
     alpha = rendering.splat_alpha
     assert colour is not None
     assert alpha is not None
-    absolute = partial(photometric, l1=1.0, ssim=0.0, unsure=frame.unsure)
+    absolute = partial(photometric, l1=1.0, ssim=0.0, ignored=frame.ignored)
     return absolute(colour, frame.image) + absolute(alpha, frame.mask)

@@ -84,9 +84,9 @@ def write_distances(
 
     # One sentence for the terminal.
     parts = []
-    for own in _bins(table):
+    for group in _bins(table):
         parts.append(
-            f"{own.low:g} to {own.high:g}: {own.psnr:.2f} dB ({own.images:g})"
+            f"{group.low:g} to {group.high:g}: {group.psnr:.2f} dB ({group.images:g})"
         )
     means = "; ".join(parts)
     text = f"PSNR in box by distance from the training poses, in deviations (images): {means}"
@@ -101,15 +101,15 @@ def _bins(table: pd.DataFrame) -> list[Bin]:
     # The number of each image's bin, which contains its lower edge.
     place = pd.cut(table["distance"], BINS, right=False, labels=False)
     bins = []
-    for number, own in table.groupby(place):
+    for number, group in table.groupby(place):
         k = int(number)
         bins.append(
             Bin(
                 low=BINS[k],
                 high=BINS[k + 1],
-                distance=own["distance"].mean(),
-                psnr=own["psnr_person"].mean(),
-                images=len(own),
+                distance=group["distance"].mean(),
+                psnr=group["psnr_person"].mean(),
+                images=len(group),
             )
         )
     return bins
@@ -121,8 +121,8 @@ def _plot(curves: dict[str, pd.DataFrame]) -> bytes:
     axes = figure.subplots()
     for label, table in curves.items():
         bins = _bins(table)
-        x = [own.distance for own in bins]
-        y = [own.psnr for own in bins]
+        x = [group.distance for group in bins]
+        y = [group.psnr for group in bins]
 
         # The line through the means, then the images in its colour.
         (drawn,) = axes.plot(x, y, "o-", label=label)

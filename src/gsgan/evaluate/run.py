@@ -46,7 +46,7 @@ from gsgan.evaluate.scores import (
     SplitScores,
     Tally,
     empty,
-    painter,
+    make_predictor,
     score_split,
 )
 from gsgan.metrics.lpips import LPIPS_NETS, build_lpips
@@ -71,7 +71,7 @@ from gsgan.run.stored import (
 from gsgan.scene import Frame
 from gsgan.skeleton.training_poses import TrainingPoses
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track, working
 from gsgan.utils.errors import ConfigError
@@ -92,10 +92,11 @@ class ScoreOptions(CommandOptions):
     """
 
     lpips: Mapping[str, Any]
+    score_images: int | None
+    grid_rows: int
+    # gsgan.train has neither: all splits are scored, on the protocol's background
     background: str | None = None
     splits: Sequence[str] = HELD_OUT_SPLITS
-    score_images: int | None = None
-    grid_rows: int = 4
 
     @property
     def lpips_nets(self) -> Sequence[str]:
@@ -262,7 +263,7 @@ def evaluate_folder(
         score,
         console,
         data,
-        predict=painter(
+        predict=make_predictor(
             avatar.to(device), solve=solve, colours=not other, align=align
         ),
         method=method,
@@ -524,7 +525,7 @@ def _join_splits(
 ) -> Scored:
     """The scores of all splits, with the protocol's record and reasons for empty splits."""
     # An empty split has the variants of the others.
-    filled = [found.variants for found in scores.values() if found.variants]
+    filled = [split.variants for split in scores.values() if split.variants]
     variants: Iterable[str] = filled[0] if filled else (FULL, FLOOR_VARIANT)
 
     # metrics.json by split, scores.csv by image.
@@ -571,7 +572,7 @@ def make_scorer(
 
     # Some images of each split alone.
     if options.score_images is not None:
-        maximum = whole("score_images", options.score_images, 1)
+        maximum = integer("score_images", options.score_images, 1)
         marks.append(
             f"at most {maximum} images of each split, spread over its frames first"
         )

@@ -250,7 +250,7 @@ class SplitScores:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
 
 
-def painter(
+def make_predictor(
     avatar: Avatar,
     *,
     solve: bool = False,
@@ -415,7 +415,7 @@ class Tally:
             mask = last.frame.mask
             motion = truth_motion(target, frame.mask, last.target, mask)
         for name, image in images.items():
-            own = image_scores(
+            variant_scores = image_scores(
                 image,
                 target,
                 frame.mask,
@@ -429,15 +429,15 @@ class Tally:
             # The same variant of the frame before.
             if last is not None and motion is not None:
                 before = (last.images[name], last.target, last.frame.mask)
-                own["flicker"] = float(
+                variant_scores["flicker"] = float(
                     flicker(image, target, frame.mask, before)
                 )
                 error_before = last.images[name] - last.target
                 moved = warped_flicker(image - target, error_before, motion)
-                own["warped_flicker"] = moved
+                variant_scores["warped_flicker"] = moved
 
             # One row per image and variant.
-            row = {"camera": camera, "frame": number, **own}
+            row = {"camera": camera, "frame": number, **variant_scores}
             self.rows.setdefault(name, []).append(row)
 
         # Parts come last: their scores are added to the row of the final image.
@@ -499,13 +499,13 @@ class Tally:
         # Only the final image has a segmentation.
         no_parts = {SPLAT: NO_PARTS_OF_SPLAT, FLOOR_VARIANT: NO_PARTS_OF_FLOOR}
         variants = {}
-        for name, own in self.rows.items():
+        for name, rows in self.rows.items():
             if name == FULL:
                 variant = _variant(
-                    own, self.matrices, self.no_parts, self.scorer
+                    rows, self.matrices, self.no_parts, self.scorer
                 )
             else:
-                variant = _variant(own, {}, no_parts[name], self.scorer)
+                variant = _variant(rows, {}, no_parts[name], self.scorer)
             variants[name] = variant
         return SplitScores(variants, self.rows, self.grid)
 

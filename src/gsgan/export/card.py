@@ -101,10 +101,10 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         "gsgan": facts.get("version", __version__),
         "commit": facts.get("commit"),
     }
-    known = []
+    rows = []
     for key, value in about.items():
         if value not in (None, ""):
-            known.append((key, str(value)))
+            rows.append((key, str(value)))
 
     # Scores, and what makes them incomparable with others.
     scores = [_scores(run.folder)]
@@ -113,7 +113,7 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         f"# {name}\n\nOne person's avatar, trained with gsgan (GaussianGAN). {HOLDS[kind]}",
         *([HUB_USE.format(name=name)] if kind == "hub" else []),
-        f"## Data and training\n\n{markdown(('', ''), known)}",
+        f"## Data and training\n\n{markdown(('', ''), rows)}",
         f"## Effects\n\n{markdown(('effect', '', 'why'), run.avatar.effects.rows())}",
         "## Scores on held-out images\n\n" + "\n\n".join(scores),
         f"## Intended use\n\n{USE}",

@@ -44,7 +44,7 @@ from gsgan.run.drive import (
 )
 from gsgan.run.runs import Run, RunReference
 from gsgan.scene import BodyPose, cat
-from gsgan.utils.checks import above, one_of, whole
+from gsgan.utils.checks import integer, one_of, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError
@@ -67,7 +67,8 @@ ENDINGS = {
     "motion_glb": ".glb",
     "hub": "",
 }
-MOTIONS = ("bvh", "motion_glb")  # formats that hold a motion and no avatar
+# formats that hold a motion and no avatar
+MOTION_FORMATS = ("bvh", "motion_glb")
 CARD = "MODEL_CARD.md"
 PREVIEW_SIZE = 512  # pixels, of runs whose images have sizes of their own
 
@@ -133,7 +134,7 @@ def export(options: ExportOptions) -> None:
     _check_upload(options, kind)
     if kind == "usd":
         refuse_missing_usd()
-    if kind in MOTIONS:
+    if kind in MOTION_FORMATS:
         motion = _motion(options, console)
         _write(out, bvh_text(motion) if kind == "bvh" else motion_glb(motion))
         tell(
@@ -209,9 +210,10 @@ def _card_of(out: Path, sequence: bool) -> Path:
 def _place(options: ExportOptions, kind: str) -> Path:
     """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
     # A capture has motion, but no avatar.
-    if options.capture is not None and kind not in MOTIONS:
+    if options.capture is not None and kind not in MOTION_FORMATS:
         raise ConfigError(
-            f"capture: format={kind} needs run=<folder>; a capture gives {', '.join(MOTIONS)}"
+            f"capture: format={kind} needs run=<folder>; a capture gives "
+            f"{', '.join(MOTION_FORMATS)}"
         )
 
     # The name must say the format: a file with its ending, or a folder for .ply files.
@@ -227,12 +229,12 @@ def _place(options: ExportOptions, kind: str) -> Path:
 
     # Nothing is overwritten unless the user says so.
     if out.exists() and out.is_dir() != folder:
-        found = (
+        kinds = (
             "a file; expected a folder"
             if folder
             else "a folder; expected a file"
         )
-        raise ConfigError(f"out={out} is {found}")
+        raise ConfigError(f"out={out} is {kinds}")
     if (
         out.exists()
         and not options.overwrite
@@ -303,10 +305,10 @@ def _block(
 def _poses(motion: MotionOptions, options: ExportOptions, run: Run) -> Drive:
     """The frames to export; by default a held-out one."""
     # The whole motion; its length is known only now.
-    drive = drive_of(motion, run, float(above("fps", options.fps)))
+    drive = drive_of(motion, run, float(positive("fps", options.fps)))
 
     # Some of its frames, if the user asks for them.
-    start = whole("start", options.start, 0)
+    start = integer("start", options.start, 0)
     if start >= len(drive.p):
         raise ConfigError(
             f"start={start}: the motion has {len(drive.p)} frames"
@@ -314,7 +316,7 @@ def _poses(motion: MotionOptions, options: ExportOptions, run: Run) -> Drive:
     end = (
         None
         if options.frames is None
-        else start + whole("frames", options.frames, 1)
+        else start + integer("frames", options.frames, 1)
     )
     return drive.rows(np.arange(len(drive.p))[start:end])
 
@@ -322,7 +324,7 @@ def _poses(motion: MotionOptions, options: ExportOptions, run: Run) -> Drive:
 @torch.no_grad()
 def _motion(options: ExportOptions, console: Console) -> BodyMotion:
     """The body poses of a capture, or of the motion that drives a run."""
-    fps = float(above("fps", options.fps))
+    fps = float(positive("fps", options.fps))
     if options.capture is not None:
         capture = Path(options.capture).expanduser()
         return read_captured(capture, options.source.data_smpl, fps)
@@ -373,7 +375,7 @@ def _program(options: ExportOptions, run: Run, kind: str) -> bytes:
     # The other formats need the exporters of torch, which take long to import.
     if kind == "onnx":
         return onnx_program(run.avatar)
-    side = whole(
+    side = integer(
         "pixels", options.pixels or run.trained_as.image_size or 512, 1
     )
     return torch_program(run.avatar, (side, side))

@@ -131,8 +131,10 @@ def in_world(sh: Tensor, frames: Tensor) -> Tensor:
     # Colours that the part's harmonics have in its own axes, and the world's harmonics
     # with the same colours in the same directions (least squares).
     world = torch.from_numpy(even_sphere(DIRECTIONS)[1]).to(sh)  # [K, 3]
-    own = functional.normalize(world @ frames, dim=-1, eps=1e-6)  # rows Fᵀ v
-    colours = sh_basis(own, degree) @ sh
+    part_directions = functional.normalize(
+        world @ frames, dim=-1, eps=1e-6
+    )  # rows Fᵀ v
+    colours = sh_basis(part_directions, degree) @ sh
     return torch.linalg.pinv(sh_basis(world, degree)) @ colours
 
 

@@ -16,7 +16,7 @@ from gsgan.model.body_points import SkinnedPoints
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.skeleton.joints import BODY
 from gsgan.splat import Accuracy, rasterise
-from gsgan.utils.checks import above, at_least, between, whole
+from gsgan.utils.checks import at_least, between, integer, positive
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import farthest_points
 
@@ -67,16 +67,16 @@ class Fit:
             raise ConfigError(
                 "fit.accuracy cannot be null; conf/fit/standard.yaml has it"
             )
-        whole("fit.surface_steps", self.surface_steps, 0)
-        whole("fit.sweeps", self.sweeps, 1)
-        whole("fit.frames", self.frames, 1)
-        whole("fit.cameras", self.cameras, 1)
-        whole("fit.points", self.points, 1)
-        above("fit.min_mask", self.min_mask)
-        above("fit.noise", self.noise)
-        above("fit.angle_rate", self.angle_rate)
-        above("fit.transl_rate", self.transl_rate)
-        above("fit.surface_rate", self.surface_rate)
+        integer("fit.surface_steps", self.surface_steps, 0)
+        integer("fit.sweeps", self.sweeps, 1)
+        integer("fit.frames", self.frames, 1)
+        integer("fit.cameras", self.cameras, 1)
+        integer("fit.points", self.points, 1)
+        positive("fit.min_mask", self.min_mask)
+        positive("fit.noise", self.noise)
+        positive("fit.angle_rate", self.angle_rate)
+        positive("fit.transl_rate", self.transl_rate)
+        positive("fit.surface_rate", self.surface_rate)
         at_least("fit.prior", self.prior, 0)
         at_least("fit.landmarks", self.landmarks, 0)
         object.__setattr__(self, "loose", list(self.loose))
@@ -287,9 +287,9 @@ class Fitter:
             for seen in self._windows(i):
                 filled = self.surface.alpha(person, seen.camera) > 0.5
                 mask = seen.mask > 0.5
-                if seen.unsure is not None:
-                    filled &= seen.unsure < 0.5
-                    mask &= seen.unsure < 0.5
+                if seen.ignored is not None:
+                    filled &= seen.ignored < 0.5
+                    mask &= seen.ignored < 0.5
                 union = (filled | mask).sum().item()
                 if union:
                     ious.append((filled & mask).sum().item() / union)
@@ -335,6 +335,6 @@ class Fitter:
 def _wrong(alpha: Tensor, seen: Silhouette) -> Tensor:
     """The difference of alpha and mask; 0 where the image is unknown."""
     difference = (alpha - seen.mask).abs()
-    if seen.unsure is None:
+    if seen.ignored is None:
         return difference
-    return difference * (1 - seen.unsure)
+    return difference * (1 - seen.ignored)

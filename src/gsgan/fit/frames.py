@@ -19,7 +19,7 @@ from gsgan.utils.errors import DataError
 # metres around the joints, as in the avatar's windows: a wider margin costs time
 WINDOW_MARGIN = 0.25
 # quantile of the masks' areas that counts as usual: most masks may be nearly empty
-USUAL = 0.75
+USUAL_QUANTILE = 0.75
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,18 @@ class Silhouette:
     Args:
         mask: ``[1, 1, H, W]`` in [0, 1].
         camera: of the image.
-        unsure: ``[1, 1, H, W]`` 1 at pixels that are not compared; None compares all.
+        ignored: ``[1, 1, H, W]`` 1 at pixels that are not compared; None compares all.
     """
 
     mask: Tensor
     camera: Camera
-    unsure: Tensor | None = None
+    ignored: Tensor | None = None
 
     def cut(self, window: Window) -> "Silhouette":
         """The part of the image inside a window."""
-        unsure = None if self.unsure is None else window.cut(self.unsure)
+        ignored = None if self.ignored is None else window.cut(self.ignored)
         return Silhouette(
-            window.cut(self.mask), window.camera(self.camera), unsure
+            window.cut(self.mask), window.camera(self.camera), ignored
         )
 
 
@@ -129,27 +129,29 @@ class MaskedFrames:
         ]
 
     def _read(self, place: int) -> tuple[Bytes, Bytes | None]:
-        """A mask and its unsure pixels, 0..255.
+        """A mask and its ignored pixels, 0..255.
 
-        Pixels outside the camera's image are unsure, as are those that the mask marks.
+        Pixels outside the camera's image are ignored, as are those that the mask marks.
         """
-        # The mask's own unsure pixels.
-        mask, unsure = self.dataset.mask(place)
+        # The mask's own ignored pixels.
+        mask, ignored = self.dataset.mask(place)
         inside = self.dataset.inside(self.dataset.items[place])
         if inside is not None:
             outside = np.where(inside[0, 0].numpy() < 0.5, 255, 0).astype(
                 np.uint8
             )
-            unsure = outside if unsure is None else np.maximum(unsure, outside)
-        return mask, unsure
+            ignored = (
+                outside if ignored is None else np.maximum(ignored, outside)
+            )
+        return mask, ignored
 
     def _silhouette(self, place: int) -> Silhouette:
-        mask, unsure = self._masks[place]
+        mask, ignored = self._masks[place]
         camera = self.dataset.camera(self.dataset.items[place])
         return Silhouette(
             mask=self._as_tensor(mask),
             camera=camera.to(self.device),
-            unsure=None if unsure is None else self._as_tensor(unsure),
+            ignored=None if ignored is None else self._as_tensor(ignored),
         )
 
     def _as_tensor(self, pixels: Bytes) -> Tensor:
@@ -175,8 +177,8 @@ class MaskedFrames:
             # Masks are measured around the skeleton: other people do not count.
             seen = around(skeleton, self._silhouette(place))
             mask = seen.mask
-            if seen.unsure is not None:
-                mask = mask * (1 - seen.unsure)
+            if seen.ignored is not None:
+                mask = mask * (1 - seen.ignored)
 
             # The area of a pixel at the person's depth, in square metres.
             depth = seen.camera.to_camera(skeleton[None])[0, :, 2].median()
@@ -184,8 +186,10 @@ class MaskedFrames:
             areas.append(float(mask.sum() * pixel))
 
         # The usual area is that of masks with a person.
-        known = [area for area in areas if area > 0]
-        usual = float(np.quantile(known, USUAL)) if known else np.inf
+        positive = [area for area in areas if area > 0]
+        usual = (
+            float(np.quantile(positive, USUAL_QUANTILE)) if positive else np.inf
+        )
         return [
             place for place, area in enumerate(areas) if area >= minimum * usual
         ]

@@ -20,7 +20,7 @@ WORST = 5  # joints and frames named in the summary
 
 @torch.no_grad()
 def fit_report(
-    fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose
+    fitter: Fitter, body: Body, driven: BodyPose, registered: BodyPose
 ) -> dict[str, Any]:
     """Distances of landmarks from the skeletons in mm, and overlaps with the masks.
 
@@ -30,7 +30,7 @@ def fit_report(
         fitter: after the fit; its poses at the start were solved from the skeletons.
         body: of the refined shape.
         driven: the poses that were solved again, on ``body``, as held-out frames are.
-        found: the registered poses.
+        registered: the registered poses.
     """
     masked = fitter.frames
     before = fitter.surface.body
@@ -42,7 +42,7 @@ def fit_report(
     overlap = {}
     for name, of_body, pose in (
         ("solved", before, fitter.start),
-        ("registered", before, found),
+        ("registered", before, registered),
         ("driven", body, driven),
     ):
         # Joints that were not seen have no distance.
@@ -64,7 +64,7 @@ def fit_report(
         }
 
     # the angles by which the masks turned the joints
-    turned = (found.theta - fitter.start.theta).norm(dim=-1).rad2deg()
+    turned = (registered.theta - fitter.start.theta).norm(dim=-1).rad2deg()
     report["turned_degrees"] = float(turned.quantile(0.95))
     return report
 

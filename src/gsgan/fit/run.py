@@ -190,9 +190,9 @@ def fit_body(
 
     # the poses by the masks, and with them the places of the landmarks
     fitter = Fitter(settings, frames, shape_body(shape), start, seed)
-    found = _register(fitter, settings, console)
+    fitted = _register(fitter, settings, console)
     with torch.no_grad():
-        registered = found.to(torch.device("cpu"))
+        registered = fitted.to(torch.device("cpu"))
         shape = _refine_shape(data, shape, frames.frames, registered)
 
     # all poses by the skeletons again
@@ -200,7 +200,7 @@ def fit_body(
     if layout.hands is not None:
         poses[True] = _solve_all(data, shape, console, hands=True)
     driven = poses[_by_hands(data)][rows].to(device)
-    report = fit_report(fitter, shape_body(shape).to(device), driven, found)
+    report = fit_report(fitter, shape_body(shape).to(device), driven, fitted)
     report["settings"] = asdict(settings)
 
     # the files, and what they say

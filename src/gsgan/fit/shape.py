@@ -115,14 +115,14 @@ def fit_hands(
     first, last = torch.cat([bones, bones + HAND]).mT
     lengths = (hands[:, last] - hands[:, first]).norm(dim=-1)
     length = _median(lengths, seen[:, last] & seen[:, first])
-    known = length.isfinite()
-    if not known.any():
+    is_measured = length.isfinite()
+    if not is_measured.any():
         return shape
 
     # The size is the ratio of the person's lengths to the body's.
-    own = shape_body(shape).hand_landmarks
-    own_length = (own[last] - own[first]).norm(dim=-1)
-    size = length[known].sum() / own_length[known].sum()
+    landmarks = shape_body(shape).hand_landmarks
+    own_length = (landmarks[last] - landmarks[first]).norm(dim=-1)
+    size = length[is_measured].sum() / own_length[is_measured].sum()
     stretch = shape.stretch.clone()
     stretch[STRETCHED.index("hand")] *= size.clamp(*SIZES)
     shape = replace(shape, stretch=stretch)
@@ -272,20 +272,24 @@ def _pairs() -> _Pairs:
 
     for side in ("left", "right"):
         # the name of each landmark on this side, by its name without a side
-        own = {"nose": "nose"}
+        body_names = {"nose": "nose"}
         for name in names:
             if "left" in name:
                 plain = name.replace("left_", "").replace("_left", "")
-                own[plain] = name.replace("left", side)
+                body_names[plain] = name.replace("left", side)
 
         # pairs on one side, and once those across
         for sigma, text in ((SURE, RIGID), (UNSURE, LOOSE)):
             for pair in text.split(", "):
                 a, b = pair.split()
-                add(own[a], own[b], sigma)
+                add(body_names[a], body_names[b], sigma)
         if side == "left":
             for plain in ACROSS.split(", "):
-                add(own[plain], own[plain].replace("left", "right"), SURE)
+                add(
+                    body_names[plain],
+                    body_names[plain].replace("left", "right"),
+                    SURE,
+                )
     return _Pairs(
         first=torch.tensor(first),
         second=torch.tensor(second),
@@ -307,8 +311,8 @@ def _fit_lengths(
     target = _median(lengths, seen[:, a] & seen[:, b]).log()
 
     # Pairs that were never seen, or that the body lacks, have no target.
-    own = space.body.landmarks
-    used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
+    landmarks = space.body.landmarks
+    used = target.isfinite() & (landmarks[a] - landmarks[b]).isfinite().all(-1)
     a = a[used]
     b = b[used]
     sigma = sigma[used]
@@ -375,8 +379,8 @@ def _fit_landmarks(
     p = p - p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     prior = shape_prior(space)
     share = min(1.0, INDEPENDENT / len(p))
-    own = len(x) - OFFSET_COUNT
-    symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
+    n_shape = len(x) - OFFSET_COUNT
+    symmetric = torch.func.jacfwd(partial(_offsets, space))(x[n_shape:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):
         # the poses of the current shape, and their normal equations
@@ -393,7 +397,7 @@ def _fit_landmarks(
 
         # derivatives of the posed landmarks by the shape
         posed = partial(_pose, space, solver, q, root)
-        by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
+        by_body = torch.func.jacfwd(posed)(x[:n_shape], x[n_shape:])
         transforms = solver.transforms(q, root, solver.joints)
         by_offsets = transforms[:, solver.carrier, :3, :3] @ symmetric
         G = torch.cat([by_body, by_offsets], dim=-1).flatten(1, 2)  # [F, 99, S]
@@ -422,12 +426,12 @@ def _pose(
     solver: Solver,
     q: Tensor,
     root: Tensor,
-    own: Tensor,
+    shape_values: Tensor,
     offsets: Tensor,
 ) -> Tensor:
     """The landmarks ``[F, 33, 3]`` of a shape in poses."""
     # The body of this shape, and its bones in the poses.
-    body = space.body_of(shape_of(space, torch.cat([own, offsets])))
+    body = space.body_of(shape_of(space, torch.cat([shape_values, offsets])))
     transforms = solver.transforms(q, root, body.joints)
     return solver.points(transforms, body.landmarks.nan_to_num())
 

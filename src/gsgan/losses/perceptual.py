@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.nn import functional
 
-from gsgan.utils.checks import one_of, whole
+from gsgan.utils.checks import integer, one_of
 from gsgan.weights.files import NETWORKS
 from gsgan.weights.networks import (
     MIN_PIXELS,
@@ -79,9 +79,9 @@ class Perceptual(nn.Module):
         one_of(f"{key}.net", net, ("vgg", "alex"))
         one_of(f"{key}.form", form, (FEATURES, LPIPS))
         if crop is not None:
-            whole(f"{key}.crop", crop, MIN_PIXELS)
+            integer(f"{key}.crop", crop, MIN_PIXELS)
         self.crop = crop
-        self.crops = whole(f"{key}.crops", crops, 1)
+        self.crops = integer(f"{key}.crops", crops, 1)
         self.warmup = warmup
 
         # The network, its description, and a mark for tables if it is only for tests.

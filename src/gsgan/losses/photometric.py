@@ -99,16 +99,16 @@ def photometric(
     l1: float = 0.8,
     l2: float = 0.0,
     ssim: float = 0.2,
-    unsure: Tensor | None = None,
+    ignored: Tensor | None = None,
 ) -> Tensor:
     """Weighted L1, squared error and D-SSIM; a term of weight 0 is not computed.
 
     Args:
         image, target: ``[B, 3, H, W]``.
         l1, l2, ssim: weights.
-        unsure: see `without_unsure`.
+        ignored: see `without_ignored`.
     """
-    target = without_unsure(target, image, unsure)
+    target = without_ignored(target, image, ignored)
 
     # On a CPU, all terms in one pass.
     if _can_compile(image, target):
@@ -185,8 +185,8 @@ class _Photometric(torch.autograd.Function):
         return ctx.gradient * grad, None, None, None, None
 
 
-def without_unsure(
-    target: Tensor, image: Tensor, unsure: Tensor | None
+def without_ignored(
+    target: Tensor, image: Tensor, ignored: Tensor | None
 ) -> Tensor:
     """The target, with the image itself at pixels that must not contribute to a loss.
 
@@ -195,10 +195,10 @@ def without_unsure(
 
     Args:
         target, image: ``[B, 3, H, W]``.
-        unsure: ``[B, 1, H, W]``, above 0 at those pixels; None for none.
+        ignored: ``[B, 1, H, W]``, above 0 at those pixels; None for none.
     """
     return (
         target
-        if unsure is None
-        else torch.where(unsure > 0, image.detach(), target)
+        if ignored is None
+        else torch.where(ignored > 0, image.detach(), target)
     )

@@ -49,9 +49,11 @@ def psnr_where(
 ) -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = []
-    for own, truth, inside in zip(image, target, where[:, 0], strict=True):
+    for predicted, truth, inside in zip(
+        image, target, where[:, 0], strict=True
+    ):
         # The pixels as an image of one column.
-        own_pixels = own[None, :, inside, None]
+        own_pixels = predicted[None, :, inside, None]
         true_pixels = truth[None, :, inside, None]
         scores.append(psnr(own_pixels, true_pixels, pooling)[0])
     return torch.stack(scores)
@@ -237,8 +239,8 @@ def edge_scores(
     scores = []
     side = 2 * tolerance + 1
     kernel = np.ones((side, side), np.uint8)
-    for i, (own, true) in enumerate(zip(image, target, strict=True)):
-        edges = _canny(own, low, high)
+    for i, (predicted, true) in enumerate(zip(image, target, strict=True)):
+        edges = _canny(predicted, low, high)
         truth = _canny(true, low, high)
 
         # Pixels within the tolerance of an edge.

@@ -113,8 +113,10 @@ class LpipsAgainst:
             elif square is None:
                 scores[f"lpips_{net}"] = math.nan
             else:
-                own = network.features(square)
-                distance = network.distance(own, self.square_truth[net])
+                image_features = network.features(square)
+                distance = network.distance(
+                    image_features, self.square_truth[net]
+                )
                 scores[f"lpips_{net}"] = float(distance)
 
             # The score in the person's box: the maps of the whole image, enlarged to its size.
@@ -136,8 +138,10 @@ class LpipsAgainst:
         background, and computed elsewhere."""
         background = self.backgrounds[net]
         truth = self.truth[net]
-        own = background.differing(self.networks[net].network.normalise(image))
-        shown = list(filter(None, (own, truth)))
+        predicted = background.differing(
+            self.networks[net].network.normalise(image)
+        )
+        shown = list(filter(None, (predicted, truth)))
         if not shown:
             return [torch.zeros_like(x[:, :1]) for x in background.maps]
 
@@ -148,7 +152,9 @@ class LpipsAgainst:
         for stage, whole in enumerate(background.maps):
             rows = union([parts[stage].rows for parts in shown])
             columns = union([parts[stage].columns for parts in shown])
-            features.append(unit(background.on(stage, own, rows, columns)))
+            features.append(
+                unit(background.on(stage, predicted, rows, columns))
+            )
             others.append(unit(background.on(stage, truth, rows, columns)))
 
             # The rest of the map: left, right, above and below.

@@ -30,11 +30,11 @@ class Motion(NamedTuple):
     Args:
         places: ``[H, W, 2]`` x and y in the frame before of what each pixel shows; whole
             numbers are the centres of pixels.
-        known: ``[H, W]`` the person's pixels whose place is known.
+        has_place: ``[H, W]`` the person's pixels whose place is known.
     """
 
     places: Values
-    known: Bool
+    has_place: Bool
 
 
 def truth_motion(
@@ -90,11 +90,11 @@ def warped_flicker(
     Returns:
         NaN if no pixel is known.
     """
-    if not motion.known.any():
+    if not motion.has_place.any():
         return math.nan
     moved = _move(_as_array(error_before), motion.places)
     change = np.abs(_as_array(error) - moved).mean(axis=-1)
-    return float(change[motion.known].mean())
+    return float(change[motion.has_place].mean())
 
 
 def _grey(image: Tensor, part: tuple[slice, slice]) -> Bytes:

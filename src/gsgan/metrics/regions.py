@@ -25,7 +25,7 @@ BACKGROUNDS = {"black": 0.0, "white": 1.0}
 CUT_SLACK = 1e-3
 # Indices of any two corners of a box.
 CORNER_PAIRS = torch.combinations(torch.arange(8))
-HANDS = "hands"
+HANDS_REGION = "hands"
 MOUTH = "mouth"
 # On every side, relative to the longer side of the box around the projected landmarks.
 HAND_MARGIN = 0.15
@@ -241,7 +241,7 @@ def inside_hull(hull: Float, points: Float) -> Bool:
 def hands_and_mouth(
     frame: Frame, template: SkeletonTemplate
 ) -> dict[str, Tensor]:
-    """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
+    """The pixels in the boxes of both hands, `HANDS_REGION`, and of the mouth, `MOUTH`.
 
     A box surrounds the projected landmarks with a margin, is at least `MIN_BOX` pixels wide and
     high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not count. A
@@ -264,9 +264,9 @@ def hands_and_mouth(
     # Each hand's landmarks follow its wrist.
     hands = []
     for wrist, *_ in template.palms:
-        own = slice(wrist, wrist + HAND)
+        hand = slice(wrist, wrist + HAND)
         box = landmark_box(
-            pixels[:, own], seen[:, own], camera.size, HAND_MARGIN
+            pixels[:, hand], seen[:, hand], camera.size, HAND_MARGIN
         )
         hands.append(box)
 
@@ -283,9 +283,9 @@ def hands_and_mouth(
         )
     else:
         around = mouth_square(frame.skeleton[:, corners], camera)
-        known = seen[:, corners].all(dim=1, keepdim=True)
-        known = known.expand(-1, around.shape[1])
-        mouth = landmark_box(around, known, camera.size, 0.0)
+        mouth_seen = seen[:, corners].all(dim=1, keepdim=True)
+        mouth_seen = mouth_seen.expand(-1, around.shape[1])
+        mouth = landmark_box(around, mouth_seen, camera.size, 0.0)
 
     # A face turned to the camera has its mouth nearer than its ears.
     distance = camera.to_camera(frame.skeleton).norm(dim=-1)
@@ -293,7 +293,7 @@ def hands_and_mouth(
     ear_distance = distance[:, list(template.ears)].mean(dim=1)
     ahead = mouth_distance < ear_distance
     return {
-        HANDS: torch.stack(hands).any(dim=0),
+        HANDS_REGION: torch.stack(hands).any(dim=0),
         MOUTH: mouth & ahead[:, None, None, None],
     }
 

@@ -30,8 +30,8 @@ def trunk_and_limbs(
     )
     table[: len(names)] = torch.tensor([is_limb(name) for name in names])
     limbs = table[labels]
-    known = (labels > 0) & (labels != IGNORE_LABEL)
-    return {"trunk": (known & ~limbs)[:, None], "limbs": limbs[:, None]}
+    has_label = (labels > 0) & (labels != IGNORE_LABEL)
+    return {"trunk": (has_label & ~limbs)[:, None], "limbs": limbs[:, None]}
 
 
 def region_shares(

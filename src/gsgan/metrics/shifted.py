@@ -9,12 +9,12 @@ from gsgan.metrics.regions import rectangle
 
 # Pixels: the side of a block, and how far it is moved at most in each direction.
 BLOCK = 16
-REACH = 1
+MAX_SHIFT = 1
 
 
 def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """PSNR in the person's box in dB, with each block of `BLOCK` pixels of the image moved by
-    up to `REACH` pixels, in steps of half a pixel, to where its squared error is least.
+    up to `MAX_SHIFT` pixels, in steps of half a pixel, to where its squared error is least.
 
     Blocks start at the box's upper left corner; those at its other ends are smaller.
 
@@ -33,12 +33,12 @@ def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     truth = target[..., rows, columns]
     height, width = truth.shape[-2:]
 
-    # The box and `REACH` pixels around it, with cubic values halfway between the pixels.
+    # The box and `MAX_SHIFT` pixels around it, with cubic values halfway between the pixels.
     padded = functional.pad(
-        image, (REACH, REACH, REACH, REACH), mode="replicate"
+        image, (MAX_SHIFT, MAX_SHIFT, MAX_SHIFT, MAX_SHIFT), mode="replicate"
     )
-    bottom = rows.stop + 2 * REACH
-    right = columns.stop + 2 * REACH
+    bottom = rows.stop + 2 * MAX_SHIFT
+    right = columns.stop + 2 * MAX_SHIFT
     around = padded[..., rows.start : bottom, columns.start : right]
     size = (2 * around.shape[-2] - 1, 2 * around.shape[-1] - 1)
     fine = functional.interpolate(
@@ -49,8 +49,8 @@ def psnr_shifted(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     # The sums of squared errors of all blocks, by shift.
     beyond = (0, -width % BLOCK, 0, -height % BLOCK)
     sums = []
-    for y in range(4 * REACH + 1):
-        for x in range(4 * REACH + 1):
+    for y in range(4 * MAX_SHIFT + 1):
+        for x in range(4 * MAX_SHIFT + 1):
             # A step in the finer image is half a pixel.
             moved = fine[..., y:, x:][..., ::2, ::2][..., :height, :width]
             squared = (moved - truth).square().mean(dim=1, keepdim=True)

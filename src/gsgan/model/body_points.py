@@ -25,7 +25,7 @@ from gsgan.model.interpolation import Interpolation
 from gsgan.model.pose_offsets import PoseOffsets
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import AUTO, at_least, integer, positive
 from gsgan.utils.tensors import derive, farthest_points, matvec, squared_norm
 
 # share of the area at rest, below which rounding errors dominate a normal
@@ -33,7 +33,6 @@ NORMAL_FLOOR = 1e-2
 # controls that correct a point; bones that it may follow
 NEAREST_CONTROLS = 4
 FOLLOWED_BONES = 6
-AUTO = "auto"
 SKIN = 2.1  # square metres, the surface of a body of the stature
 STATURE = 1.75  # metres
 # Points per pixel of the person from which Step I's colour has scored as well as the generator's
@@ -95,9 +94,9 @@ class LearntWeights(nn.Module):
         )
 
         # The body's weights as a dense table, each row of sum 1.
-        own = bone_weight / bone_weight.sum(1, keepdim=True)
+        body_weight = bone_weight / bone_weight.sum(1, keepdim=True)
         dense = places.new_zeros(len(places), joints).scatter_add_(
-            1, bone_index, own
+            1, bone_index, body_weight
         )
 
         # The average weights of each control's points, carried back to the points.
@@ -193,7 +192,7 @@ class SkinnedPoints(nn.Module):
         # The subset is spread over the template, so that it is the same for every shape of the
         # body.
         if count is not None:
-            whole("points", count, 1)
+            integer("points", count, 1)
         vertices = body.vertices.float()
         template = vertices if body.template is None else body.template.float()
         every = len(vertices)
@@ -215,13 +214,13 @@ class SkinnedPoints(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
         # The learnt weights start at the body's, as they are on the template.
-        own = (
+        start = (
             template[chosen],
             self.bone_index,
             self.bone_weight,
             len(body.joints),
         )
-        self.learnt = LearntWeights(*own, controls) if controls else None
+        self.learnt = LearntWeights(*start, controls) if controls else None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -372,18 +371,18 @@ class BodyPoints(nn.Module):
         if points == AUTO:
             points = points_for(stature, scale, spacing)
         if points is not None:
-            points = whole("model.body_points.points", points, 1)
+            points = integer("model.body_points.points", points, 1)
             body = subdivide(body, points)
 
         # The points, and how Ψ learns with them.
-        above("model.body_points.sigma", sigma)
-        above("model.body_points.mean_step", mean_step)
+        positive("model.body_points.sigma", sigma)
+        positive("model.body_points.mean_step", mean_step)
         self.points = SkinnedPoints(
-            body, points, whole("model.body_points.controls", controls, 0)
+            body, points, integer("model.body_points.controls", controls, 0)
         )
         self.sigma = sigma
         self.mean_step = mean_step
-        self.rate = above("model.body_points.rate", rate)
+        self.rate = positive("model.body_points.rate", rate)
 
         # Where joints bend, points leave their place on the body.
         self.offsets = None
@@ -397,7 +396,7 @@ class BodyPoints(nn.Module):
         # The bound of Ψ's scales, in body heights.
         self.scale_max = None
         if scale_spacings is not None:
-            above("model.body_points.scale_spacings", scale_spacings)
+            positive("model.body_points.scale_spacings", scale_spacings)
             spacing = float(self.points.spacing.median())
             self.scale_max = scale_spacings * spacing / stature
 
@@ -414,10 +413,10 @@ class BodyPoints(nn.Module):
         self.stretch = stretch
         self.stretch_limit = math.inf
         if stretch_limit is not None:
-            self.stretch_limit = above(
+            self.stretch_limit = positive(
                 "model.body_points.stretch_limit", stretch_limit
             )
-        self.stretch_every = whole(
+        self.stretch_every = integer(
             "model.body_points.stretch_every", stretch_every, 1
         )
         self.renew()
@@ -577,7 +576,7 @@ def points_for(stature: float, scale: float, spacing: float) -> int:
         scale: pixels per metre at the person.
         spacing: pixels.
     """
-    above("model.body_points.spacing", spacing)
+    positive("model.body_points.spacing", spacing)
 
     # The skin's area grows with the square of the stature.
     area = SKIN * (stature / STATURE) ** 2

@@ -20,7 +20,7 @@ from gsgan.model.residual_gaussians import (
 from gsgan.skeleton import Points
 from gsgan.skeleton.densify import rows_of
 from gsgan.splat.sh import brighten
-from gsgan.utils.checks import between, whole
+from gsgan.utils.checks import between, integer
 from gsgan.utils.tensors import derive, farthest_points
 
 NEAREST_ANCHORS = 3  # anchors between which the MLP's output is interpolated
@@ -79,7 +79,7 @@ class Deformation(ResidualGaussians):
         super().__init__(stature, **settings)
         between(
             "model.deformation: layers",
-            whole("model.deformation: layers", layers, 2),
+            integer("model.deformation: layers", layers, 2),
             2,
             1000,
         )
@@ -88,7 +88,7 @@ class Deformation(ResidualGaussians):
         every = len(rest_points)
         self.anchored = anchors is not None and anchors < every
         if anchors is not None and self.anchored:
-            whole("model.deformation.anchors", anchors, NEAREST_ANCHORS)
+            integer("model.deformation.anchors", anchors, NEAREST_ANCHORS)
             rest_points = self._place_anchors(rest_points, anchors)
         points = len(rest_points)
         self.position_octaves = position_octaves
@@ -175,9 +175,9 @@ class Deformation(ResidualGaussians):
         )
 
         # Few poses have fewer directions than the buffer; the rest keep a spread of 0.
-        known = min(POSE_AXES, len(spread))
-        self.pose_axes[:, :known] = axes[:known].mT
-        self.pose_spread.zero_()[:known] = spread[:known] / len(codes) ** 0.5
+        n_axes = min(POSE_AXES, len(spread))
+        self.pose_axes[:, :n_axes] = axes[:n_axes].mT
+        self.pose_spread.zero_()[:n_axes] = spread[:n_axes] / len(codes) ** 0.5
 
         # The places that the MLP is computed at, their mean and standard deviation.
         if self.anchored:
@@ -313,11 +313,13 @@ class Deformation(ResidualGaussians):
     def _point_part(self) -> Tensor:
         """``[N, width]``: the part of the first layer that depends on the point alone."""
         layer = self.from_point
-        own = self.embedding
+        embedding = self.embedding
 
         def make() -> Tensor:
             # The place at rest and the learned numbers of the point.
-            features: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            features: Tensor = layer(
+                torch.cat([self.rest_code, embedding], dim=-1)
+            )
             return features
 
         return derive(
@@ -326,7 +328,7 @@ class Deformation(ResidualGaussians):
             make,
             layer.weight,
             layer.bias,
-            own,
+            embedding,
             self.rest_code,
         )
 
@@ -344,7 +346,7 @@ class Deformation(ResidualGaussians):
 
         # The codes at rest are the same in every item of the batch.
         size = code.shape[:2]
-        known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
+        inputs = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
         weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
 
         # The pose is the same for all points of an item, so it is part of the bias.
@@ -353,7 +355,7 @@ class Deformation(ResidualGaussians):
         # Weights and biases take turns, as `_Trunk` expects them.
         layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
         x: Tensor = _Trunk.apply(
-            known, self.embedding.expand(*size, -1), weight, bias, *layers
+            inputs, self.embedding.expand(*size, -1), weight, bias, *layers
         )
         return x
 
@@ -431,15 +433,15 @@ class _Trunk(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        known: Tensor,
+        given: Tensor,
         learned: Tensor,
         weight: Tensor,
         bias: Tensor,
         *layers: Tensor,
     ) -> Tensor:
         # The first layer, whose bias differs from item to item.
-        B, N, _ = known.shape
-        inputs = torch.cat([known, learned], dim=-1).flatten(0, 1)
+        B, N, _ = given.shape
+        inputs = torch.cat([given, learned], dim=-1).flatten(0, 1)
         x = (
             (inputs @ weight.mT)
             .view(B, N, -1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.utils.checks import one_of, whole
+from gsgan.utils.checks import integer, one_of
 
 LEAKY_SLOPE = 0.2
 
@@ -26,7 +26,7 @@ class PatchDiscriminator(nn.Module):
         self, base: int = 64, layers: int = 4, norm: str = "instance"
     ) -> None:
         super().__init__()
-        whole("training.discriminator.layers", layers, 2)
+        integer("training.discriminator.layers", layers, 2)
         one_of("training.discriminator.norm", norm, ("instance", "none"))
         normal = norm == "instance"
 

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.utils.checks import one_of
+from gsgan.utils.checks import AUTO, one_of
 from gsgan.utils.tensors import derive, full_precision
 
 # inside the root: an all-zero pixel (empty background) stays zero
 NORM_FLOOR = 1e-6
 SLOPE = 0.2
-AUTO = "auto"
 MIDDLE_BLOCKS = 2  # convolutions at the coarsest level
 
 

@@ -37,7 +37,7 @@ RATES = {
     "features": 10.0,
 }
 # makes the first harmonic 1, and the mean square of each
-UNIT = math.sqrt(4 * math.pi)
+UNIT_HARMONIC = math.sqrt(4 * math.pi)
 # joints, visibility, body: `gsgan.run.drive`
 Pose = tuple[Tensor, Tensor, BodyPose | None]
 
@@ -55,7 +55,7 @@ def harmonics(normals: Tensor) -> Tensor:
     Source: the irradiance of a convex diffuse surface under distant light is within 1 % of such a
     function (Ramamoorthi and Hanrahan, 2001).
     """
-    return UNIT * sh_basis(normals.nan_to_num(0.0, 0.0, 0.0), 2)
+    return UNIT_HARMONIC * sh_basis(normals.nan_to_num(0.0, 0.0, 0.0), 2)
 
 
 class Harmonic(ResidualGaussians):

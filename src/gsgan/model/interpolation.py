@@ -52,8 +52,8 @@ class Interpolation:
 
         # On a CPU the gradient multiplies the transpose, in precisions that scipy has.
         trained = torch.is_grad_enabled() and values.requires_grad
-        known = values.dtype in (torch.float32, torch.float64)
-        if trained and known and values.device.type == "cpu":
+        is_float = values.dtype in (torch.float32, torch.float64)
+        if trained and is_float and values.device.type == "cpu":
             transpose = self._transpose(near, share, len(values))
             result: Tensor = _Interpolated.apply(
                 values, rows, weights, chosen, transpose

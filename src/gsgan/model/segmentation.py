@@ -24,7 +24,7 @@ IGNORE = 255
 PROBABILITY_FLOOR = 1e-6
 # a point's neighbour up to which its Gaussian reaches
 GAP_NEIGHBOUR = 4
-HANDS = ("left_hand", "right_hand")
+HAND_LABELS = ("left_hand", "right_hand")
 FACE_CLASS = "face_neck"
 
 
@@ -324,7 +324,7 @@ def class_map(
 
 def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
     # Every requested group must be among those that the labels name.
-    requested = (*HANDS, FACE_CLASS) if face else HANDS
+    requested = (*HAND_LABELS, FACE_CLASS) if face else HAND_LABELS
     groups = [group_of_part(name) for name in label_names]
     lacking = [name for name in requested if name not in groups]
     if lacking:

@@ -38,7 +38,7 @@ FPS = 30.0  # assumed if neither the file nor the user gives a rate
 # Maximum relative difference of bone lengths at which a motion is the subject's own.
 OWN_LENGTHS = 0.02
 # A joint seen in a smaller share of the frames counts as a false detection.
-MIN_SEEN = 0.2
+MIN_BONE_SEEN = 0.2
 ROUNDED = 5e-4  # relative difference of a rate from a whole number
 JUST_BEYOND = 0.05  # share of a frame
 MAX_GAP = 5  # frames: in a longer gap a hand or face is not seen
@@ -90,9 +90,9 @@ def mask_unseen(motion: Clip, min_visibility: float) -> Clip:
     # Shoulders and hips count at any visibility above 0.
     trunk = list(TRUNK_LANDMARKS)
     finite: Bool = np.asarray(np.isfinite(motion.p).all(-1))
-    known = finite & (motion.visibility >= min_visibility)
-    known[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
-    good = known[:, trunk].sum(1) >= MIN_TRUNK_JOINTS
+    has_place = finite & (motion.visibility >= min_visibility)
+    has_place[:, trunk] = finite[:, trunk] & (motion.visibility[:, trunk] > 0)
+    good = has_place[:, trunk].sum(1) >= MIN_TRUNK_JOINTS
     if not good.any():
         raise DataError(
             f"{motion.path}: none of {len(motion)} frames has shoulders and hips (NaN, or not seen)"
@@ -108,12 +108,12 @@ def mask_unseen(motion: Clip, min_visibility: float) -> Clip:
 
     # Landmarks are mixed; one that only one side has is taken from the nearer
     # frame.
-    p = np.where(known[..., None], motion.p, np.nan)
+    p = np.where(has_place[..., None], motion.p, np.nan)
     filled = mix(p[before], p[after], share)
     filled = np.where(np.isfinite(filled), filled, p[nearest])
 
     # Hands and face stay.
-    visibility = np.where(known, motion.visibility, 0.0)
+    visibility = np.where(has_place, motion.visibility, 0.0)
     shown = visibility[nearest]
     filled[:, BODY:] = p[:, BODY:]
     shown[:, BODY:] = visibility[:, BODY:]
@@ -135,10 +135,10 @@ class Neighbours(NamedTuple):
     share: Float  # [F] of the latter, in [0, 1]
 
 
-def neighbours(known: Bool) -> Neighbours:
-    """The nearest known frames before and after each frame of ``known [F]``."""
-    at = np.flatnonzero(known)
-    times = np.arange(len(known))
+def neighbours(has_place: Bool) -> Neighbours:
+    """The nearest known frames before and after each frame of ``has_place [F]``."""
+    at = np.flatnonzero(has_place)
+    times = np.arange(len(has_place))
     first_after = np.searchsorted(at, times)
     after = at[first_after.clip(max=len(at) - 1)]
     last_before = np.searchsorted(at, times, side="right") - 1
@@ -172,8 +172,8 @@ def is_own(motion: Clip, subject: Proportions) -> bool:
 
 def up_axis(motion: Clip) -> str:
     """The axis nearest to the median direction from hips to shoulders, e.g. "-y"."""
-    known = np.nan_to_num(motion.p)
-    spine = middle(known, SHOULDERS) - middle(known, HIPS)
+    places = np.nan_to_num(motion.p)
+    spine = middle(places, SHOULDERS) - middle(places, HIPS)
     return axis_name(np.median(spine, axis=0))
 
 
@@ -181,21 +181,21 @@ def complete(motion: Clip, up: str) -> Float:
     """All landmarks ``[F, J, 3]`` in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
-    `MIN_SEEN` of the frames show takes its place in the rest pose, relative to its parent. Gaps of
-    a hand or the face of up to `MAX_GAP` frames are interpolated; in longer ones it is NaN.
+    `MIN_BONE_SEEN` of the frames show takes its place in the rest pose, relative to its parent.
+    Gaps of a hand or the face of up to `MAX_GAP` frames are interpolated; in longer ones it is NaN.
     """
     # Offsets of the body's joints from their parents are interpolated.
     whole = motion.p @ upright(up).T
     p = whole[:, :BODY]
-    known: Bool = np.asarray(np.isfinite(p).all(-1))
+    has_place: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
 
     # Parents come first: a joint that is not seen follows its parent.
     for joint, parent in PARENT.items():
         offset = p[:, joint] - p[:, parent]
-        seen = known[:, joint] & known[:, parent]
-        if seen.mean() < MIN_SEEN:
-            known[:, joint] = False
+        seen = has_place[:, joint] & has_place[:, parent]
+        if seen.mean() < MIN_BONE_SEEN:
+            has_place[:, joint] = False
         elif not seen.all():
             # In between, the bone turns from where it was to where it is seen
             # again.
@@ -203,10 +203,10 @@ def complete(motion: Clip, up: str) -> Float:
             for axis in range(3):
                 filled = np.interp(times, times[seen], offset[seen, axis])
                 p[gaps, joint, axis] = p[gaps, parent, axis] + filled[gaps]
-            known[:, joint] = known[:, parent]
+            has_place[:, joint] = has_place[:, parent]
 
     # Joints without an offset take their places in the rest pose.
-    body, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
+    body, _ = sanitise(torch.from_numpy(p), torch.from_numpy(has_place))
 
     # Hands and the face.
     parts = [body.numpy()]
@@ -217,12 +217,12 @@ def complete(motion: Clip, up: str) -> Float:
 
 def _bridge(part: Float) -> Float:
     """A hand or face ``[F, n, 3]``; gaps of up to `MAX_GAP` frames are interpolated."""
-    known: Bool = np.asarray(np.isfinite(part).all((1, 2)))
-    if not known.any():
+    is_finite: Bool = np.asarray(np.isfinite(part).all((1, 2)))
+    if not is_finite.any():
         return part
-    before, after, share = neighbours(known)
+    before, after, share = neighbours(is_finite)
     is_short = (after - before - 1 <= MAX_GAP) & (after > before)
-    bridged = ~known & is_short
+    bridged = ~is_finite & is_short
     filled = mix(part[before], part[after], share)
     return np.where(bridged[:, None, None], filled, part)
 

@@ -65,7 +65,7 @@ class GltfFile:
     def __init__(
         self,
         path: Path,
-        known: tuple[str, ...] | None = None,
+        extensions: tuple[str, ...] | None = None,
     ) -> None:
         refuse_empty(path)
         data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
@@ -81,7 +81,7 @@ class GltfFile:
 
         # A required extension that is ignored would give wrong positions.
         for name in self.doc.extensionsRequired or ():
-            unknown = known is not None and not name.startswith(known)
+            unknown = extensions is not None and not name.startswith(extensions)
             if name in UNSUPPORTED or unknown:
                 raise DataError(
                     f"{path}: {name} is not supported; export it without"

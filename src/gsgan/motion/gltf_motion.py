@@ -300,13 +300,13 @@ def _pose_node(
         "scale": entry.scale or [1, 1, 1],
     }
     sampled = {}
-    for path, own in values.items():
+    for path, default in values.items():
         if (node, path) in channels:
             channel = channels[node, path]
             sampled[path] = _sample(channel, times, rotation=path == "rotation")
         else:
             # A property without keys is the same in all frames.
-            constant = np.array(own, np.float64)
+            constant = np.array(default, np.float64)
             sampled[path] = np.broadcast_to(
                 constant, (len(times), len(constant))
             )
@@ -340,6 +340,6 @@ def _names(glb: GltfFile, nodes: list[int]) -> tuple[str, ...]:
         helper = "__"
     names = []
     for node in nodes:
-        own = glb.doc.nodes[node].name or f"node{node}"
-        names.append(mapped.get(node, helper + own))
+        node_name = glb.doc.nodes[node].name or f"node{node}"
+        names.append(mapped.get(node, helper + node_name))
     return tuple(names)

@@ -111,8 +111,8 @@ def plain_names(names: Iterable[str | None]) -> list[str]:
             if word is None or count <= enough or TELLING.fullmatch(word):
                 break
             plain = [
-                pattern.sub("", name) if own == word else name
-                for name, own in zip(plain, words, strict=True)
+                pattern.sub("", name) if plain_name == word else name
+                for name, plain_name in zip(plain, words, strict=True)
             ]
     return plain
 
@@ -145,11 +145,11 @@ def humanoid_bones(
         pairs = [(node, mixamo_bone(name)) for node, name in enumerate(plain)]
 
     # The first node of each bone counts.
-    found: dict[str, int] = {}
+    nodes_of_bones: dict[str, int] = {}
     for node, bone in pairs:
         if bone is not None:
-            found.setdefault(bone, node)
-    return {node: bone for bone, node in found.items()}
+            nodes_of_bones.setdefault(bone, node)
+    return {node: bone for bone, node in nodes_of_bones.items()}
 
 
 def _choices(table: str) -> dict[str, tuple[dict[str, float], ...]]:
@@ -209,15 +209,17 @@ for _choice in chain.from_iterable(PART_SHAPES.values()):
     WANTED.update(_choice)
 
 
-def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
+def canonical_shapes(file_shapes: Mapping[str, Array]) -> dict[str, Array]:
     """The canonical shapes ``[V, 3]`` that a file's own shapes can make."""
     shapes = {}
     for shape, choices in PART_SHAPES.items():
         for choice in choices:
-            if not choice.keys() <= found.keys():
+            if not choice.keys() <= file_shapes.keys():
                 continue
             # The first choice that the file has all terms of is taken, unless it is empty.
-            terms = [weight * found[name] for name, weight in choice.items()]
+            terms = [
+                weight * file_shapes[name] for name, weight in choice.items()
+            ]
             total = np.sum(terms, axis=0)
             if np.abs(total).max() > 0:
                 shapes[shape] = total

@@ -13,7 +13,7 @@ from gsgan.motion.retarget import heading
 from gsgan.motion.rotations import matvec
 from gsgan.scene import Camera
 from gsgan.skeleton.proportions import Proportions, upright
-from gsgan.utils.checks import above, between
+from gsgan.utils.checks import between, positive
 
 Float = NDArray[np.float64]
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Orbit:
         between("orbit.elevation", self.elevation, -89, 89)
         between("orbit.fov", self.fov, 1, 150)
         if self.distance is not None:
-            above("orbit.distance", self.distance)
+            positive("orbit.distance", self.distance)
 
     def cameras(
         self,

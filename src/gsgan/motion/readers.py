@@ -182,10 +182,10 @@ def _with_missing(clip: Clip) -> Clip:
     visibility = clip.visibility
     if not visibility.any():
         visibility = np.ones_like(visibility)
-    known = np.isfinite(p).all(-1)
-    if not known.any():
+    has_place = np.isfinite(p).all(-1)
+    if not has_place.any():
         raise ValueError("no joint of any frame has a position")
-    return replace(clip, p=p, visibility=np.where(known, visibility, 0.0))
+    return replace(clip, p=p, visibility=np.where(has_place, visibility, 0.0))
 
 
 # -- numpy's npz: landmarks, body poses, SMPL, MediaPipe
@@ -470,8 +470,8 @@ def _body_pose(
 
     # Frames with NaN were posed as zeros.
     p = subject.posed_landmarks(poses).double().numpy()
-    known = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
-    p[~known] = np.nan
+    is_finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
+    p[~is_finite] = np.nan
     return Clip(
         path=path,
         p=p,
@@ -525,7 +525,7 @@ def _smpl(
     betas = betas[: model.shapedirs.shape[-1]]
 
     # Frames with NaN are posed as zeros, and set to NaN again below.
-    known = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
+    is_finite = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
     theta = _for_model(np.nan_to_num(poses).reshape(F, -1, 3), model)
     moves = np.nan_to_num(moves)
 
@@ -544,7 +544,7 @@ def _smpl(
     shapes = np.repeat(betas[None], F, axis=0)
     motion = smpl_motion.SmplMotion(np.arange(F), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
-    p[~known] = np.nan
+    p[~is_finite] = np.nan
     if "frame_id" in arrays:
         rows, at = _in_time(path, arrays, F)
         p = _at_times(p[rows], at, np.nan)
@@ -631,8 +631,8 @@ def _rotation_vectors(path: Path, values: Any) -> Float:
     given = np.asarray(values, np.float64)
     if given.ndim == 4 and given.shape[2:] == (3, 3):
         turns = np.full(given.shape[:3], np.nan)
-        known = np.isfinite(given).all((2, 3))
-        turns[known] = Rotation.from_matrix(given[known]).as_rotvec()
+        is_finite = np.isfinite(given).all((2, 3))
+        turns[is_finite] = Rotation.from_matrix(given[is_finite]).as_rotvec()
         given = turns
     if given.ndim > 3 or (given.ndim == 3 and given.shape[2] != 3):
         raise DataError(
@@ -742,9 +742,9 @@ def _landmark_row(where: str, frame: Any) -> Float:
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
         if key is None and not any("andmark" in key for key in frame):
-            found = ", ".join(map(str, list(frame)[:6])) or "nothing"
+            keys = ", ".join(map(str, list(frame)[:6])) or "nothing"
             raise DataError(
-                f"{where}: expected MediaPipe's pose_world_landmarks, found {found}"
+                f"{where}: expected MediaPipe's pose_world_landmarks, found {keys}"
             )
         if key is None:
             raise DataError(

@@ -107,14 +107,14 @@ def retarget(
             from_wrist, palm = _pose_hand(given[:, hand], subject, wrist)
             result[:, hand] = q[:, wrist, None] + from_wrist
             turn = np.where(np.isfinite(palm), palm, turn)
-        own = rest[list(ends)] - rest[wrist]
-        q[:, ends] = q[:, wrist, None] + own @ turn.mT
+        offsets = rest[list(ends)] - rest[wrist]
+        q[:, ends] = q[:, wrist, None] + offsets @ turn.mT
 
     # Feet: turned as heel, toe and ankle.
     for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
-        own = rest[list(feet)] - rest[ankle]
-        q[:, feet] = q[:, ankle, None] + own @ turn.mT
+        offsets = rest[list(feet)] - rest[ankle]
+        q[:, feet] = q[:, ankle, None] + offsets @ turn.mT
 
     # The neck, bent from the chest's axes by at most `MAX_NECK_BEND`
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
@@ -151,14 +151,14 @@ def transfer_face(p: Float, rest: Float) -> Float:
     """
     # All frames as one, whose points are aligned with as many copies of the subject's face.
     given = torch.from_numpy(p)
-    own = torch.from_numpy(rest)
+    rest_places = torch.from_numpy(rest)
     seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
-    onto = own.repeat(len(given), 1)
+    onto = rest_places.repeat(len(given), 1)
     face = _align(given.reshape(1, -1, 3), onto, seen).reshape(p.shape)
 
     # Expressions are offsets from the other person's face at rest.
     at_rest, _ = face.nanmedian(0)
-    return (own + face - at_rest).numpy()
+    return (rest_places + face - at_rest).numpy()
 
 
 def steady(p: Float) -> Float:
@@ -270,8 +270,8 @@ def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
         ):
             joint = start + i
             ends = landmarks[joint]
-            own = rest[list(ends)] - rest[joint]
-            turned = own @ standard.turns[side + bone].mT
+            offsets = rest[list(ends)] - rest[joint]
+            turned = offsets @ standard.turns[side + bone].mT
             p[:, ends] = p[:, joint, None] + turned
 
     # The head, at the end of the neck.
@@ -316,8 +316,8 @@ def join(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
         )
 
         # Landmarks that an end lacks are missing in between.
-        known = np.isfinite(ends).all((0, 2))[:, None]
-        transition = np.where(known, path(np.arange(1, n + 1)), np.nan)
+        has_path = np.isfinite(ends).all((0, 2))[:, None]
+        transition = np.where(has_path, path(np.arange(1, n + 1)), np.nan)
         parts.append(retarget(transition, subject, scale=1.0))
         parts.append(after)
     return np.concatenate(parts)

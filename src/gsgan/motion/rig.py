@@ -351,14 +351,14 @@ class Pose:
         character = self.rig.character
         rotations = [self.rotation(bone) for bone in character.bones]
         joints = [self.position(bone) for bone in character.bones]
-        known = {}
+        face_shapes = {}
         for name, weight in shapes.items():
             if name in character.shapes:
-                known[name] = weight
+                face_shapes[name] = weight
         return Animation(
             rotations=np.stack(rotations, axis=1),
             joints=np.stack(joints, axis=1),
-            shapes=known,
+            shapes=face_shapes,
             passages=passages,
         )
 

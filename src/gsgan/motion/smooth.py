@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.utils.checks import above, at_least
+from gsgan.utils.checks import at_least, positive
 
 Float = NDArray[np.float64]
 
@@ -49,11 +49,11 @@ class OneEuro:
     _last: _Last | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        above("smooth.min_cutoff", self.min_cutoff)
+        positive("smooth.min_cutoff", self.min_cutoff)
         at_least("smooth.beta", self.beta, 0)
-        above("smooth.speed_cutoff", self.speed_cutoff)
-        above("smooth.max_speed", self.max_speed)
-        above("smooth.max_pause", self.max_pause)
+        positive("smooth.speed_cutoff", self.speed_cutoff)
+        positive("smooth.max_speed", self.max_speed)
+        positive("smooth.max_pause", self.max_pause)
 
     def __call__(self, p: Float, seconds: float) -> Float:
         """The joints ``[J, 3]`` smoothed; metres, NaN where a joint is not known.

@@ -252,37 +252,37 @@ def standard_motion(
     Raises:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = body_joints(rig, path)
+    joint_of = body_joints(rig, path)
     posed = rig.pose()
 
     # The axis that points up, and left and right.
     zero = rig.zero_pose()[None]
 
     # A zero pose that stands tells which axis is up.
-    highest = _upward(zero, known)
-    stands = tilts(zero, known, highest).max() < MAX_STANDING_TILT
+    highest = _upward(zero, joint_of)
+    stands = tilts(zero, joint_of, highest).max() < MAX_STANDING_TILT
     zero_axis = highest if stands else None
     if up is None:
-        axis = _upward(posed, known, usual=zero_axis)
+        axis = _upward(posed, joint_of, usual=zero_axis)
     else:
         # The user's axis, with its sign.
         axis = np.zeros(3)
         axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
-    known = _by_side(posed, known, axis)
+    joint_of = _by_side(posed, joint_of, axis)
 
     # Turns of limbs and fingers. Axes by positions do not depend on the zero pose.
-    reference = _reference(rig, posed, known, axis, zero_axis)
-    axes = person_axes(posed[:1], known, axis)[0]
-    R, turns = _turns(rig, axes, known, reference)
+    reference = _reference(rig, posed, joint_of, axis, zero_axis)
+    axes = person_axes(posed[:1], joint_of, axis)[0]
+    R, turns = _turns(rig, axes, joint_of, reference)
 
     # Corrections by positions, if no zero pose is known.
-    joints = {bone: posed[:, j] @ axes.T for bone, j in known.items()}
+    joints = {bone: posed[:, j] @ axes.T for bone, j in joint_of.items()}
     if not reference.zero:
         _bend_in_plane(turns, joints)
         _point_hands(turns, joints)
         if not reference.neutral:
             _flatten_feet(turns, joints)
-    turns |= _trunk(rig, known, R)
+    turns |= _trunk(rig, joint_of, R)
 
     # The median length of a leg.
     thigh = np.linalg.norm(joints["LeftUpLeg"] - joints["LeftLeg"], axis=1)
@@ -302,9 +302,9 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     Raises:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = find_joints(rig.names)
+    joint_of = find_joints(rig.names)
     missing = [
-        bone for bone in REQUIRED if bone not in known and bone != "Hips"
+        bone for bone in REQUIRED if bone not in joint_of and bone != "Hips"
     ]
     if missing:
         names = [name for name in rig.names if not name.endswith(" end")]
@@ -314,8 +314,8 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         )
 
     # One person has a joint above both legs, and not each limb twice.
-    above_left = _line(rig, known["LeftUpLeg"])
-    above_right = _line(rig, known["RightUpLeg"])
+    above_left = _line(rig, joint_of["LeftUpLeg"])
+    above_right = _line(rig, joint_of["RightUpLeg"])
     shared = [j for j in above_left if j in above_right]
 
     # Every limb several times means several skeletons.
@@ -326,14 +326,14 @@ def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
         raise DataError(
             f"{path} holds more than one person; give a file of one"
         )
-    known.setdefault("Hips", shared[-1])
+    joint_of.setdefault("Hips", shared[-1])
 
     # The joint after a finger's last bone is its end.
-    for bone in list(known):
-        if re.search(r"Hand\D+[23]$", bone) and known[bone] in rig.parents:
+    for bone in list(joint_of):
+        if re.search(r"Hand\D+[23]$", bone) and joint_of[bone] in rig.parents:
             end = bone[:-1] + str(int(bone[-1]) + 1)
-            known.setdefault(end, rig.parents.index(known[bone]))
-    return known
+            joint_of.setdefault(end, rig.parents.index(joint_of[bone]))
+    return joint_of
 
 
 def _count(rig: RigMotion, bone: str) -> int:
@@ -355,22 +355,22 @@ def _line(rig: RigMotion, j: int) -> list[int]:
     return line
 
 
-def _middle(p: Array, known: dict[str, int], bone: str) -> Array:
+def _middle(p: Array, joint_of: dict[str, int], bone: str) -> Array:
     """The middle ``[..., 3]`` of a pair of joints of poses ``[..., J, 3]``."""
-    left = p[..., known["Left" + bone], :]
-    right = p[..., known["Right" + bone], :]
+    left = p[..., joint_of["Left" + bone], :]
+    right = p[..., joint_of["Right" + bone], :]
     return (left + right) / 2
 
 
-def _across(p: Array, known: dict[str, int], bone: str) -> Array:
+def _across(p: Array, joint_of: dict[str, int], bone: str) -> Array:
     """The way ``[..., 3]`` from the right to the left joint of poses ``[..., J, 3]``."""
-    left = p[..., known["Left" + bone], :]
-    right = p[..., known["Right" + bone], :]
+    left = p[..., joint_of["Left" + bone], :]
+    right = p[..., joint_of["Right" + bone], :]
     return left - right
 
 
 def _upward(
-    p: Array, known: dict[str, int], usual: Array | None = None
+    p: Array, joint_of: dict[str, int], usual: Array | None = None
 ) -> Array:
     """The coordinate axis ``[3]`` that points up.
 
@@ -378,9 +378,9 @@ def _upward(
     poses ``[F, J, 3]``. The ``usual`` axis is taken if the person stands along it in some poses and
     lies in the others.
     """
-    hips = _middle(p, known, "UpLeg")
-    trunk = unit(_middle(p, known, "Arm") - hips)
-    legs = unit(hips - _middle(p, known, "Foot"))
+    hips = _middle(p, joint_of, "UpLeg")
+    trunk = unit(_middle(p, joint_of, "Arm") - hips)
+    legs = unit(hips - _middle(p, joint_of, "Foot"))
 
     # The smaller cosine of trunk and legs with each axis.
     axes = np.concatenate([np.eye(3), -np.eye(3)])
@@ -400,35 +400,35 @@ def _upward(
     return np.asarray(axes[score.argmax()])
 
 
-def person_axes(p: Array, known: dict[str, int], up: Array) -> Array:
+def person_axes(p: Array, joint_of: dict[str, int], up: Array) -> Array:
     """``[..., 3, 3]`` rows left, back, up of poses ``[..., J, 3]``; ``up [..., 3]`` is kept."""
-    left = _across(p, known, "UpLeg")
+    left = _across(p, joint_of, "UpLeg")
     vertical = (left * up).sum(-1, keepdims=True) * up
     left = unit(left - vertical)
     up = np.broadcast_to(up, left.shape)
     return np.stack([left, np.cross(up, left), up], axis=-2)
 
 
-def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
+def _by_side(p: Array, joint_of: dict[str, int], up: Array) -> dict[str, int]:
     """The joints; left and right are exchanged if knees and toes would point backwards."""
     # Votes above 0 are behind the line from hip to ankle, or behind the ankle.
-    back = person_axes(p, known, up)[:, 1]
+    back = person_axes(p, joint_of, up)[:, 1]
     votes = []
     for side in SIDES:
-        hip = p[:, known[side + "UpLeg"]]
-        knee = p[:, known[side + "Leg"]]
-        ankle = p[:, known[side + "Foot"]]
+        hip = p[:, joint_of[side + "UpLeg"]]
+        knee = p[:, joint_of[side + "Leg"]]
+        ankle = p[:, joint_of[side + "Foot"]]
         bend = knee - (hip + ankle) / 2
         votes.append((bend * back).sum(-1))
-        if side + "ToeBase" in known:
-            toe = p[:, known[side + "ToeBase"]]
+        if side + "ToeBase" in joint_of:
+            toe = p[:, joint_of[side + "ToeBase"]]
             votes.append(((toe - ankle) * back).sum(-1))
     if np.mean(np.stack(votes) > 0) < BACKWARDS:
-        return known
+        return joint_of
 
     # The same joints by the names of the other side.
     exchanged = {}
-    for bone, j in known.items():
+    for bone, j in joint_of.items():
         if bone.startswith("Left"):
             bone = bone.replace("Left", "Right", 1)
         elif bone.startswith("Right"):
@@ -437,26 +437,26 @@ def _by_side(p: Array, known: dict[str, int], up: Array) -> dict[str, int]:
     return exchanged
 
 
-def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
+def tilts(p: Array, joint_of: dict[str, int], up: Array) -> Array:
     """Angles ``[..., 7]`` between poses ``[..., J, 3]`` and a person who stands upright.
 
     Radians, for the trunk, the left and right thigh and shin, hips and shoulders.
     """
-    axes = person_axes(p, known, up)
+    axes = person_axes(p, joint_of, up)
     left = axes[..., 0, :]
     up = axes[..., 2, :]
 
     # Directions of the body's parts, and those of a person who stands.
-    trunk = _middle(p, known, "Arm") - _middle(p, known, "UpLeg")
+    trunk = _middle(p, joint_of, "Arm") - _middle(p, joint_of, "UpLeg")
     pairs = [(trunk, up)]
     for side in SIDES:
-        hip = p[..., known[side + "UpLeg"], :]
-        knee = p[..., known[side + "Leg"], :]
-        ankle = p[..., known[side + "Foot"], :]
+        hip = p[..., joint_of[side + "UpLeg"], :]
+        knee = p[..., joint_of[side + "Leg"], :]
+        ankle = p[..., joint_of[side + "Foot"], :]
         pairs.append((knee - hip, -up))
         pairs.append((ankle - knee, -up))
     for bone in ("UpLeg", "Arm"):
-        pairs.append((_across(p, known, bone), left))
+        pairs.append((_across(p, joint_of, bone), left))
 
     cosines = []
     for direction, standing in pairs:
@@ -467,7 +467,7 @@ def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
 def _reference(
     rig: RigMotion,
     posed: Array,
-    known: dict[str, int],
+    joint_of: dict[str, int],
     up: Array,
     zero_axis: Array | None,
 ) -> Reference:
@@ -476,14 +476,14 @@ def _reference(
         zero = rig.zero_pose()[None]
         return Reference(
             rotations=np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:])),
-            axes=person_axes(zero, known, zero_axis),
+            axes=person_axes(zero, joint_of, zero_axis),
             joints=zero,
             zero=True,
             neutral=True,
         )
 
     # The frames that stand as well as the best one, else all whose trunk is upright.
-    tilt = tilts(posed, known, up)
+    tilt = tilts(posed, joint_of, up)
     worst = tilt.max(axis=-1)
     best = float(worst.min())
     neutral = best < MAX_NEUTRAL_TILT
@@ -500,7 +500,7 @@ def _reference(
     chosen = chosen[:: max(1, len(chosen) // MAX_REFERENCES)]
     return Reference(
         rotations=rig.rotations[chosen],
-        axes=person_axes(posed[chosen], known, up),
+        axes=person_axes(posed[chosen], joint_of, up),
         joints=posed[chosen],
         zero=False,
         neutral=neutral,
@@ -508,16 +508,16 @@ def _reference(
 
 
 def _turns(
-    rig: RigMotion, axes: Array, known: dict[str, int], reference: Reference
+    rig: RigMotion, axes: Array, joint_of: dict[str, int], reference: Reference
 ) -> tuple[Array, dict[str, Array]]:
     """Turns ``[F, J, 3, 3]`` of all joints, and of the known bones with their turns at rest."""
     # Turns of the limbs in the reference poses, by joint positions.
     at_rest = []
     for A, p in zip(reference.axes, reference.joints, strict=True):
-        joints = {bone: A @ p[j] for bone, j in known.items()}
+        joints = {bone: A @ p[j] for bone, j in joint_of.items()}
         at_rest.append(rest_turns(joints))
     if not reference.neutral:
-        _follow_positions(at_rest, known, reference)
+        _follow_positions(at_rest, joint_of, reference)
 
     # A joint's turn is R @ C: its world rotation R in the person's axes, times the constant C
     # that gives the known turns in the reference poses.
@@ -525,7 +525,7 @@ def _turns(
     to_rest = reference.rotations.mT @ reference.axes.mT[:, None]
     R = axes @ rig.rotations
     turns = {}
-    for bone, j in known.items():
+    for bone, j in joint_of.items():
         if bone.endswith("4"):  # a finger's tip follows its last bone
             continue
         # Fingers of one joint rest as the hand.
@@ -540,20 +540,26 @@ def _turns(
 
 
 def _follow_positions(
-    at_rest: list[dict[str, Array]], known: dict[str, int], reference: Reference
+    at_rest: list[dict[str, Array]],
+    joint_of: dict[str, int],
+    reference: Reference,
 ) -> None:
     """Adds the turns of the trunk and the feet of frames in which the person does not stand."""
     for turn, A, p in zip(
         at_rest, reference.axes, reference.joints, strict=True
     ):
         # The trunk, by the line from hips to shoulders.
-        trunk = A @ (_middle(p, known, "Arm") - _middle(p, known, "UpLeg"))
+        trunk = A @ (
+            _middle(p, joint_of, "Arm") - _middle(p, joint_of, "UpLeg")
+        )
         turn["Hips"] = between(np.array([0.0, 0, 1]), trunk)
 
         # Feet, by their heading.
         for side in SIDES:
-            if side + "ToeBase" in known:
-                toe = A @ (p[known[side + "ToeBase"]] - p[known[side + "Foot"]])
+            if side + "ToeBase" in joint_of:
+                toe = A @ (
+                    p[joint_of[side + "ToeBase"]] - p[joint_of[side + "Foot"]]
+                )
                 foot = between(np.array([0.0, -1, 0]), toe * (1, 1, 0))
                 turn[side + "Foot"] = foot
                 turn[side + "ToeBase"] = foot
@@ -682,18 +688,20 @@ def drift(path: Array, step: float) -> Array:
     return np.asarray(smooth[pad : pad + len(path)])
 
 
-def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
+def _trunk(
+    rig: RigMotion, joint_of: dict[str, int], R: Array
+) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
-    left = _line(rig, known["LeftArm"])
-    right = _line(rig, known["RightArm"])
+    left = _line(rig, joint_of["LeftArm"])
+    right = _line(rig, joint_of["RightArm"])
     turns = {}
 
     # The spine is above both arms but not above the legs; the file's bones are interpolated.
-    hips = [*_line(rig, known["LeftUpLeg"]), known["Hips"]]
+    hips = [*_line(rig, joint_of["LeftUpLeg"]), joint_of["Hips"]]
     spine = [j for j in left if j in right and j not in hips]
 
     # The standard's joints lie at even steps along the file's spine.
-    chain = [known["Hips"], *spine]
+    chain = [joint_of["Hips"], *spine]
     for k, bone in enumerate(SPINE, 1):
         at = k * len(spine) / len(SPINE)
         below = int(at)
@@ -702,8 +710,8 @@ def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
         turns[bone] = blend(R[:, lower], R[:, upper], at - below)
 
     # The neck is above the head only; without one, it turns half-way.
-    if "Head" in known:
-        head = known["Head"]
+    if "Head" in joint_of:
+        head = joint_of["Head"]
         neck = [j for j in _line(rig, head) if j not in left]
         if neck:
             turns["Neck"] = R[:, neck[0]]

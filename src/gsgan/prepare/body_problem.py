@@ -50,7 +50,7 @@ OUTLIER = 3.0  # standard deviations at which a landmark counts half
 # weight of the prior of arms and legs, which would make them shorter
 LIMB_PRIOR = 0.05
 MAX_TIME_GAP = 0.5  # seconds: motion is not smooth over a longer gap
-MAX_STEPS = 20  # maximum number of Gauss-Newton steps
+MAX_NEWTON_STEPS = 20  # maximum number of Gauss-Newton steps
 MIN_GAIN = 1e-4  # relative change of the cost at which the solver stops
 # Levenberg-Marquardt damping: its first value, and its factors after a good and a bad step.
 START_DAMPING = 1e-3
@@ -336,7 +336,7 @@ class BodyProblem(ABC):
         return carried + R[:, solver.carrier] @ of_landmarks
 
     def minimise(
-        self, at: State, steps: int = MAX_STEPS
+        self, at: State, steps: int = MAX_NEWTON_STEPS
     ) -> tuple[State, float]:
         """The solution, and its cost."""
         # Levenberg-Marquardt: a step that raises the cost is undone.

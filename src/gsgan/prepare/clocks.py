@@ -19,19 +19,20 @@ from gsgan.utils.pickles import read_arrays
 Value = TypeVar("Value")
 
 # Time stamps that differ by less, in frames, are those of one clock: numbers pair the frames.
-SAME = 0.25
+SAME_LAG = 0.25
 # share by which a rate may differ from the one that the header has, and be that one
-ROUNDED = 0.01
+LAG_ROUNDING = 0.01
 # of a camera's step: an image farther from a moment does not show it
 BETWEEN = 0.55
 
 LAG = 90  # frames by which clocks are compared, either way, at most half of the frames
 COMPARED = 400  # frames of one camera that are compared, at most
-NEIGHBOURS = 4  # cameras with which each camera is compared, at most
+MAX_COMPARED = 4  # cameras with which each camera is compared, at most
 MIN_MATCHES = 30  # joints in common, of all frames
-OUTLIER = 3.0  # times the median error: a joint that contradicts every lag
-ITERATIONS = 10  # of reweighting
-CERTAIN = 0.1  # frames: pairs of cameras that agree within it have full weight
+LAG_OUTLIER = 3.0  # times the median error: a joint that contradicts every lag
+REWEIGHTINGS = 10  # of reweighting
+# frames: pairs of cameras that agree within it have full weight
+FULL_WEIGHT_FRAMES = 0.1
 SIMILAR = 1.3  # times the least error: another delay fits nearly as well
 EQUAL = 1.1  # times the least error: a lag fits as well
 APART = 5  # frames between delays that are told apart
@@ -139,7 +140,7 @@ def rate_of(video: Recording, time: Float) -> float:
     steps = np.diff(time)
     count = np.round(steps / np.median(steps)).clip(min=1).sum()
     rate = float(count / (time[-1] - time[0]))
-    if video.fps and abs(rate / video.fps - 1) < ROUNDED:
+    if video.fps and abs(rate / video.fps - 1) < LAG_ROUNDING:
         return video.fps
     return rate
 
@@ -149,7 +150,7 @@ def _agree(times: Mapping[str, Float], rate: float) -> bool:
     longest = max(times.values(), key=len)
     for time in times.values():
         apart = np.abs(time - longest[: len(time)])
-        if len(time) and apart.max() * rate > SAME:
+        if len(time) and apart.max() * rate > SAME_LAG:
             return False
     return True
 
@@ -240,12 +241,12 @@ def clock_errors(
     pairs = []
     lags = []
     for a, b in _pairs(C):
-        found = _lag_of(
+        pair_lag = _lag_of(
             rays[a], rays[b], cameras.centres[b] - cameras.centres[a], reach
         )
-        if found is not None:
+        if pair_lag is not None:
             pairs.append((a, b))
-            lags.append(found)
+            lags.append(pair_lag)
     if not pairs:
         return ClockErrors(delay, gain, other)
 
@@ -299,7 +300,7 @@ def _pairs(cameras: int) -> list[tuple[int, int]]:
     """Pairs of cameras: each with the next ones, round and round."""
     pairs = set()
     for a in range(cameras):
-        for step in range(1, NEIGHBOURS + 1):
+        for step in range(1, MAX_COMPARED + 1):
             b = (a + step) % cameras
             if a != b:
                 pairs.add((min(a, b), max(a, b)))
@@ -353,7 +354,7 @@ def _lag_of(a: Float, b: Float, baseline: Float, reach: int) -> _Lag | None:
     three = three[:, np.isfinite(three).all(0)]
     smallest = np.abs(three).min(0)
     changes = np.sign(three).min(0) < np.sign(three).max(0)
-    limit = OUTLIER * errors[reach + best]
+    limit = LAG_OUTLIER * errors[reach + best]
     used = three[:, changes | (smallest <= limit)]
     if used.shape[1] < MIN_MATCHES:
         return None
@@ -379,12 +380,12 @@ def _delays(C: int, pairs: Ints, lags: Float) -> Float:
     # Pairs that contradict the others lose their weight.
     weight = np.ones(len(pairs))
     delay = np.zeros(C)
-    for _ in range(ITERATIONS):
+    for _ in range(REWEIGHTINGS):
         scaled = weight[:, None]
         solved = np.linalg.lstsq(rows * scaled, lags * weight, rcond=None)[0]
         delay = np.asarray(solved, np.float64)
         off = np.abs(rows @ delay - lags)
-        weight = np.sqrt(1 / np.maximum(off, CERTAIN))
+        weight = np.sqrt(1 / np.maximum(off, FULL_WEIGHT_FRAMES))
 
     # Relative to the median camera, a real one.
     paired = np.unique(pairs)

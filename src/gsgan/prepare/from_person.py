@@ -152,13 +152,13 @@ def _solution(
 
     # Errors in pixels of the images, and angles between rays.
     flat = sided.reshape(C, -1, 2)
-    found = robust(rig, flat, seen.reshape(C, -1))
-    used = is_known(found.p)
+    surface = robust(rig, flat, seen.reshape(C, -1))
+    used = is_known(surface.p)
     if not used.any():
         raise DataError(
             "calibration=person: no landmark is seen alike by two cameras; do frame numbers agree?"
         )
-    error = rig.errors(found.p, flat) * per_image[:, None]
+    error = rig.errors(surface.p, flat) * per_image[:, None]
     error = np.where(seen.reshape(C, -1) > 0, error, np.nan)
 
     # The focal lengths, in pixels of the images.
@@ -170,7 +170,7 @@ def _solution(
     return Calibrated(
         cameras=entries,
         error=np.nanmedian(error, axis=1),
-        angle=_ray_angle(rig, found.p[used], seen.reshape(C, -1)[:, used]),
+        angle=_ray_angle(rig, surface.p[used], seen.reshape(C, -1)[:, used]),
     )
 
 

@@ -19,7 +19,7 @@ from gsgan.utils.arrays import Bool, Bytes, Float, Ints
 
 BORDER = 3  # pixels: an outline so near to the border goes on beyond it
 MIN_AREA = 400  # pixels of a silhouette
-INSIDE = 127  # of 255: larger values are the person
+INSIDE_LEVEL = 127  # of 255: larger values are the person
 
 
 class Outline(NamedTuple):
@@ -51,10 +51,10 @@ def find_outlines(
     """
     result = []
     for camera in cameras:
-        known = alphas[camera.name]
+        by_number = alphas[camera.name]
         outlines: list[Outline | None] = []
         for number in numbers[camera.name].tolist():
-            alpha = known.get(number)
+            alpha = by_number.get(number)
             outlines.append(None if alpha is None else _outline(camera, alpha))
         result.append(outlines)
     return result
@@ -63,7 +63,7 @@ def find_outlines(
 def _outline(camera: CameraEntry, mask: Bytes) -> Outline | None:
     """The hull of the largest piece of a mask ``[H, W]``."""
     pieces, _ = cv2.findContours(
-        (mask > INSIDE).astype(np.uint8),
+        (mask > INSIDE_LEVEL).astype(np.uint8),
         cv2.RETR_EXTERNAL,
         cv2.CHAIN_APPROX_NONE,
     )

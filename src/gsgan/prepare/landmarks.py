@@ -33,7 +33,7 @@ UNTOLD = (
     "its 25 joints were read as BODY_25, which cannot be told from BODY_25B: no frame shows neck "
     "and hips"
 )
-MAX_SHARE = (
+MAX_PEOPLE_SHARE = (
     2.0  # of the image's size: a cut-off body may reach beyond the image
 )
 MAX_PEOPLE = 5  # of a file, those with most confidence
@@ -109,7 +109,7 @@ def read_detections(path: Path) -> Detections:
 
     # Some detectors write shares of the image's size.
     seen = px[conf > 0]
-    if len(seen) and np.abs(seen).max() <= MAX_SHARE:
+    if len(seen) and np.abs(seen).max() <= MAX_PEOPLE_SHARE:
         raise DataError(
             f"{path}: all landmarks are between {seen.min():.2f} and {seen.max():.2f}; expected "
             "pixels of the image, not shares of its size"
@@ -144,11 +144,11 @@ def gather(
     # Frames that a camera lacks stay NaN.
     px = np.full((len(ids), len(frames), ALL, 2), np.nan)
     conf = np.zeros(px.shape[:3])
-    for c, (own, detected) in enumerate(
+    for c, (rows, detected) in enumerate(
         zip(ids, detections.values(), strict=True)
     ):
-        valid = own >= 0
-        at = np.searchsorted(frames, own[valid])
+        valid = rows >= 0
+        at = np.searchsorted(frames, rows[valid])
         px[c, at] = detected.px[valid]
         conf[c, at] = detected.conf[valid]
     return Gathered(frames, px, conf)
@@ -174,16 +174,20 @@ def _read_json(path: Path) -> Detections:
     """Detections in a folder of JSON files; the person with most confidence is the first one."""
     # The people of each file, and the set of joints of all bodies together.
     files = json_files(path)
-    found = []
+    detections = []
     for file in files.values():
         seen = [one for one in _read_people(file) if _confidence(one) > 0]
-        found.append(sorted(seen, key=_confidence, reverse=True)[:MAX_PEOPLE])
-    numbers, notes = joint_numbers([p.body for all_ in found for p in all_])
+        detections.append(
+            sorted(seen, key=_confidence, reverse=True)[:MAX_PEOPLE]
+        )
+    numbers, notes = joint_numbers(
+        [p.body for all_ in detections for p in all_]
+    )
 
     px = np.full((len(files), ALL, 2), np.nan)
     conf = np.zeros((len(files), ALL))
     people = []
-    for f, persons in enumerate(found):
+    for f, persons in enumerate(detections):
         people.append([_joints(person, numbers) for person in persons])
         if persons:
             px[f], conf[f] = people[f][0]

@@ -139,15 +139,17 @@ def with_lifter(world: Tensor, u: Tensor, weight: Tensor) -> Tensor:
 
     with torch.inference_mode():
         shown = weight[:, read].float()
-        found = _lifter()(u[None, :, read].float(), shown[None])[0]
-    lifted = found.clone().to(world)
+        estimate = _lifter()(u[None, :, read].float(), shown[None])[0]
+    lifted = estimate.clone().to(world)
 
     # Both from the middle of the hips; the detector's are scaled to the lifter's.
     lifted = lifted - lifted[:, HIP_JOINTS].mean(1, keepdim=True)
-    own = world - world[:, HIP_JOINTS].mean(1, keepdim=True)
+    centred = world - world[:, HIP_JOINTS].mean(1, keepdim=True)
     w = weight.unsqueeze(-1)
-    scale = (w * own * lifted).nansum() / (w * own.square()).nansum()
-    return torch.where(own.isfinite(), (scale * own + lifted) / 2, lifted)
+    scale = (w * centred * lifted).nansum() / (w * centred.square()).nansum()
+    return torch.where(
+        centred.isfinite(), (scale * centred + lifted) / 2, lifted
+    )
 
 
 @lru_cache(maxsize=1)

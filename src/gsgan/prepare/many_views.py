@@ -22,16 +22,16 @@ from gsgan.skeleton.joints import BODY
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.arrays import evenly_spaced
 
-KEYFRAMES = 40  # maximum number of frames that determine the shape
+SHAPE_FRAMES = 40  # maximum number of frames that determine the shape
 SHAPE_STEPS = 12  # Gauss-Newton steps of the shape
-POSE_STEPS = 8  # of all poses
+ALL_POSE_STEPS = 8  # of all poses
 # Frames that are solved at once, and those that two parts share: their motion is continuous.
 PART = 240
-SHARED = 12
+SHARED_FRAMES = 12
 # A cut: joints move (median) by this many times the usual step, and by this many metres.
 CUT_RATIO = 4.0
 MIN_CUT = 0.15
-MIN_SEEN = 0.05  # share of the frames: a joint that fewer show is not inferred in the others
+MIN_SEEN_SHARE = 0.05  # share of the frames: a joint that fewer show is not inferred in the others
 CUT_SECONDS = 10.0  # longer than any gap that a motion passes
 
 
@@ -77,23 +77,25 @@ def solve_views(views: Views) -> Tensor:
         return p
 
     # The shape, which starts as a usual one.
-    keys = rows[evenly_spaced(len(rows), KEYFRAMES, ends=True)]
+    keys = rows[evenly_spaced(len(rows), SHAPE_FRAMES, ends=True)]
     problem = ViewsProblem(views[keys], shape=True, smooth=False)
     state, _ = problem.minimise(problem.start(), SHAPE_STEPS)
 
     # The poses, part by part; the first frames of a part were solved with the last one.
-    for first in range(0, max(len(rows) - SHARED, 1), PART - SHARED):
+    for first in range(
+        0, max(len(rows) - SHARED_FRAMES, 1), PART - SHARED_FRAMES
+    ):
         at = rows[first : first + PART]
         whole = ViewsProblem(views[at], shape=False, smooth=True)
         start = replace(whole.start(), shared=state.shared)
-        found, _ = whole.minimise(start, POSE_STEPS)
-        X = whole.landmarks(found, whole.solver(found.shared))
+        solution, _ = whole.minimise(start, ALL_POSE_STEPS)
+        X = whole.landmarks(solution, whole.solver(solution.shared))
         new = p[at].isnan().all(-1).all(-1)
-        new |= torch.arange(len(at)) >= SHARED // 2
+        new |= torch.arange(len(at)) >= SHARED_FRAMES // 2
         p[at[new]] = X[new]
 
     # Nothing says where the legs of a person are whose legs are in no image.
-    p[:, seen.double().mean(0) < MIN_SEEN] = torch.nan
+    p[:, seen.double().mean(0) < MIN_SEEN_SHARE] = torch.nan
     return p
 
 

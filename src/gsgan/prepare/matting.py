@@ -26,7 +26,7 @@ MIN_BLOB = 0.02
 MIN_ROOM = 3  # images that show a pixel of the room: fewer do not tell it
 ROWS = 64  # rows of all images at once, which bounds the memory
 # Lengths as shares of the height of the person's box.
-PERSON_MARGIN = 0.025  # round the mask: the room is not taken from there
+ROOM_MARGIN = 0.025  # round the mask: the room is not taken from there
 BAND = 0.015  # half the width of the band round the outline in which alpha is estimated
 # Colours are from 0 to 255.
 EDGE = 2  # pixels beside the outline whose colours are compared
@@ -37,7 +37,9 @@ DARKEST_SHADOW = 0.4  # of the room's colour, in the person's shadow
 GUIDE_RADIUS = 2  # pixels of the guided filter
 GUIDE_NOISE = 6.0  # differences of colour below it are noise
 ROOM_NOISE = 8.0  # standard deviation of the room's colours
-UNSURE = 3.0  # evidence that a pixel like the room has against the person
+UNSURE_EVIDENCE = (
+    3.0  # evidence that a pixel like the room has against the person
+)
 MAX_CHANGE = (
     20.0  # median change of the room beside the person; more is another room
 )
@@ -49,7 +51,7 @@ class Room:
     """The empty room of one camera."""
 
     colour: Bytes  # [H, W, 3] as the images
-    known: Bool  # [H, W] whether the room was seen there
+    seen: Bool  # [H, W] whether the room was seen there
 
 
 def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
@@ -103,7 +105,7 @@ def study_room(
             mask = tidy(read_mask_values(masks[number]), levels)
             images[number] = image
             tidied[number] = mask
-            reach = _disc(_pixels(mask, PERSON_MARGIN))
+            reach = _disc(_pixels(mask, ROOM_MARGIN))
             free.append(cv2.dilate(mask, reach) == 0)
 
     # The median of each pixel: values that do not count are sorted to the end.
@@ -160,19 +162,21 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
     band = ~(inside | outside)
 
     # The room in this image, with its exposure; unknown if the camera has moved.
-    known = room.known[window]
+    room_seen = room.seen[window]
     empty = room.colour[window].astype(np.float32)
-    shown = outside & known
+    shown = outside & room_seen
     if shown.any():
         exposure = _exposure(seen[shown], empty[shown])
         empty = np.asarray(empty * exposure, np.float32)
         change = np.abs(seen[shown] - empty[shown]).mean(-1)
-        known = known & bool(np.median(change) < MAX_CHANGE)
+        room_seen = room_seen & bool(np.median(change) < MAX_CHANGE)
 
     # Whether each pixel is the person: the mask's evidence, and how unlike the room it is.
     behind = _shade_room(seen, empty, prior)
-    unlike = ((seen - behind) ** 2).sum(-1) / (2 * ROOM_NOISE**2) - UNSURE
-    unlike = np.where(known, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
+    unlike = ((seen - behind) ** 2).sum(-1) / (
+        2 * ROOM_NOISE**2
+    ) - UNSURE_EVIDENCE
+    unlike = np.where(room_seen, unlike.clip(-MAX_EVIDENCE, MAX_EVIDENCE), 0)
     blurred = cv2.GaussianBlur(prior, (0, 0), reach / 2).clip(0.02, 0.98)
     evidence = np.log(blurred / (1 - blurred)) + unlike
     evidence = cv2.ximgproc.guidedFilter(
@@ -189,7 +193,7 @@ def cut_out(image: Bytes, mask: Bytes, room: Room) -> CutOut:
     around = cv2.dilate(chosen, _disc(1)) > 0
     person = _spread(seen, core, EDGE)
     beside = _spread(seen, ~around, EDGE)
-    behind = np.where(known[..., None], behind, beside)
+    behind = np.where(room_seen[..., None], behind, beside)
     difference = person - behind
     contrast = (difference**2).sum(-1)
     share = ((seen - behind) * difference).sum(-1) / np.maximum(contrast, 1.0)
@@ -251,12 +255,12 @@ def _shade_room(seen: Single, room: Single, prior: Single) -> Single:
 
 def _spread(seen: Single, inside: Bool, reach: int) -> Single:
     """The colours ``[H, W, 3]`` inside, spread outwards: means of what is near."""
-    known = inside.astype(np.float32)
+    inside_weight = inside.astype(np.float32)
     spread = np.zeros_like(seen)
-    total = np.zeros_like(known)
+    total = np.zeros_like(inside_weight)
     # Wider means, with less weight, where a narrow one finds nothing.
     for width, weight in ((reach, 1.0), (4 * reach, 1e-3), (16 * reach, 1e-6)):
         size = (2 * width + 1, 2 * width + 1)
-        spread += weight * cv2.blur(seen * known[..., None], size)
-        total += weight * cv2.blur(known, size)
+        spread += weight * cv2.blur(seen * inside_weight[..., None], size)
+        total += weight * cv2.blur(inside_weight, size)
     return np.asarray(spread / np.maximum(total, 1e-12)[..., None], np.float32)

@@ -117,15 +117,15 @@ def run_tool(
         each_camera(one, "finding landmarks", missing, options.workers)
 
     # The masks; a source without any shows nobody.
-    found = {}
+    landmark_files = {}
     for name, folder in folders.items():
         files = sorted(folder.glob("*.png"))
         if masks and not files:
             raise DataError(
                 f"MediaPipe found nobody in {name}; show a person, or leave it out"
             )
-        found[name] = {int(path.stem): path for path in files}
-    return People(results, found)
+        landmark_files[name] = {int(path.stem): path for path in files}
+    return People(results, landmark_files)
 
 
 def _detect(command: list[str], source: Path, advance: Advance) -> None:

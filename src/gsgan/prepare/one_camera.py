@@ -65,7 +65,9 @@ from gsgan.utils.pickles import read_arrays
 
 # Errors of focal lengths over the solution's own estimate, on synthetic scenes.
 OVERCONFIDENT = 3.0
-DOUBTFUL = 3.0  # a frame with this many times the usual error is left out
+MAX_ERROR_RATIO = (
+    3.0  # a frame with this many times the usual error is left out
+)
 # The result is in doubt with a video that ends early, a shorter video, a smaller turn, a background
 # that moves more, more images of several people, or fewer images of the feet.
 MIN_SECONDS = 8.0  # seconds
@@ -211,7 +213,7 @@ def doubtful_poses(errors: Float) -> Bool:
             without a seen landmark is not doubtful.
     """
     medians = nanmedian(errors, axis=1)
-    return medians > DOUBTFUL * nanmedian(medians, axis=0)
+    return medians > MAX_ERROR_RATIO * nanmedian(medians, axis=0)
 
 
 def _read(
@@ -277,11 +279,11 @@ def with_right_sides(seen: Detected, time: Float) -> Detected:
 
     # Each hand is at the wrist that is nearer to it; a hand that was not seen does not count.
     hands = [LEFT.start, RIGHT.start]
-    known = np.where(conf[..., None] > 0, px, np.nan)
-    wrists = known[:, WRIST_JOINTS]
-    own = np.linalg.norm(known[:, hands] - wrists, axis=-1)
-    other = np.linalg.norm(known[:, hands] - wrists[:, ::-1], axis=-1)
-    crossed = np.nansum(other, axis=1) < np.nansum(own, axis=1)
+    seen_px = np.where(conf[..., None] > 0, px, np.nan)
+    wrists = seen_px[:, WRIST_JOINTS]
+    distance = np.linalg.norm(seen_px[:, hands] - wrists, axis=-1)
+    other = np.linalg.norm(seen_px[:, hands] - wrists[:, ::-1], axis=-1)
+    crossed = np.nansum(other, axis=1) < np.nansum(distance, axis=1)
 
     # Left and right hand take each other's place.
     hand_z = seen.hand_z.copy()
@@ -450,52 +452,52 @@ def _measure(
 
 
 def _notes(
-    found: Mapping[str, Any], options: Options, natural: float
+    summary: Mapping[str, Any], options: Options, natural: float
 ) -> list[str]:
     """Sentences on what was estimated, and on what is in doubt."""
     # The estimates.
-    focal = f"focal length {found['focal_px']:.0f} pixels, {found['focal_mm']:.0f} mm on film"
+    focal = f"focal length {summary['focal_px']:.0f} pixels, {summary['focal_mm']:.0f} mm on film"
     if options.focal is None:
-        stated = found["focal_stated"]
+        stated = summary["focal_stated"]
         origin = (
             f" from the {stated:g} mm that the file states" if stated else ""
         )
-        uncertainty = f"{found['focal_uncertainty']:.0%}"
+        uncertainty = f"{summary['focal_uncertainty']:.0%}"
         focal += f", ± {uncertainty}, estimated{origin}; focal=<mm> sets it"
     notes = [focal]
     if options.height is None:
         notes.append(
             f"height {natural:.2f} m, as a usual person; height=<m> sets it"
         )
-    if found["left_out"]:
-        counts = found["left_out"].items()
+    if summary["left_out"]:
+        counts = summary["left_out"].items()
         reasons = ", ".join(f"{reason} {count}" for reason, count in counts)
         notes.append(
-            f"left out of {found['sampled']} sampled images: {reasons}"
+            f"left out of {summary['sampled']} sampled images: {reasons}"
         )
 
-    return notes + _doubts(found)
+    return notes + _doubts(summary)
 
 
-def _doubts(found: Mapping[str, Any]) -> list[str]:
+def _doubts(summary: Mapping[str, Any]) -> list[str]:
     """Sentences on what is in doubt, each with its limit."""
     notes = list[str]()
-    if found["hdr"]:
+    if summary["hdr"]:
         notes.append(
-            f"doubtful: the video's colours are HDR ({found['hdr']}) and are not converted, so the "
-            "avatar's will be wrong; film without HDR, or convert the video"
+            f"doubtful: the video's colours are HDR ({summary['hdr']}) and are not converted, so "
+            "the avatar's will be wrong; film without HDR, or convert the video"
         )
 
-    if found["decoded"] < MIN_DECODED:
+    if summary["decoded"] < MIN_DECODED:
         notes.append(
-            f"doubtful: only {found['decoded']:.0%} of the frames that the video should have can "
+            f"doubtful: only {summary['decoded']:.0%} of the frames that the video should have can "
             "be decoded; copy it again"
         )
 
     # The film: how long, from how many sides, by a camera that stands still.
-    seconds = found["seconds"]
-    turned = found["degrees_seen"]
-    moved = found["background_moved"]
+    seconds = summary["seconds"]
+    turned = summary["degrees_seen"]
+    moved = summary["background_moved"]
     if seconds < MIN_SECONDS:
         notes.append(
             f"doubtful: {seconds:.1f} seconds are short, 20 to 40 are better"
@@ -510,8 +512,8 @@ def _doubts(found: Mapping[str, Any]) -> list[str]:
         )
 
     # The people in it.
-    others = found["several_faces"]
-    feet = found["feet_seen"]
+    others = summary["several_faces"]
+    feet = summary["feet_seen"]
     if others > MAX_OTHER_FACES:
         notes.append(
             f"doubtful: {others:.0%} of the images show more than one face; "
@@ -521,6 +523,6 @@ def _doubts(found: Mapping[str, Any]) -> list[str]:
         notes.append(
             f"doubtful: feet are in {feet:.0%} of the images; legs and distance are guesses"
         )
-    if not found["standing"]:
+    if not summary["standing"]:
         notes.append("doubtful: no foot stood still, so the ground is a guess")
     return notes

@@ -1,7 +1,7 @@
 """The options of `gsgan.prepare`, and the images and cameras that they name."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from gsgan.prepare.sources import (
     upright,
 )
 from gsgan.skeleton.proportions import UP_AXES
-from gsgan.utils.checks import above, between, one_of, whole
+from gsgan.utils.checks import between, integer, one_of, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -40,9 +40,9 @@ FREE_OPTIONS = ("out", "setup", "workers", "overwrite", "keep_work")
 class MediaPipe:
     """The landmark tool and its environment, see conf/prepare.yaml."""
 
-    folder: str | None = None
-    python: str | None = None
-    threads: int = 1
+    folder: str | None
+    python: str | None
+    threads: int
 
 
 @dataclass(frozen=True)
@@ -55,34 +55,34 @@ class Options(CommandOptions):
 
     source: str | None
     out: str | None
-    calibration: str | None = None
-    cameras: Mapping[str, Any] | None = None
-    unit: str | None = None
-    pixel_centre: float = 0.0
-    crop_px: int = 16
-    height: float | None = None
-    focal: float | None = None
-    person: tuple[float, float, float, float] | None = None
-    landmark_noise: float = 0.008
-    offsets: Mapping[str, int] | None = None
-    frames: Any = None
-    fps: float | None = None
-    up_axis: str | None = None
-    apply_rotation: bool = False
-    landmarks: str = MEDIAPIPE
-    masks: str = MEDIAPIPE
-    hands: bool = True
-    face: bool = True
-    setup: bool = False
-    workers: int = 2
-    overwrite: bool = False
-    keep_work: bool = True
-    mediapipe: MediaPipe = field(default_factory=MediaPipe)
-    solve: SolveSettings = field(default_factory=SolveSettings)
-    mask_levels: tuple[float, float] = (0.3, 0.8)
-    matting: bool = True
-    scale: float = 1.0
-    format: str = "jpg"
+    calibration: str | None
+    cameras: Mapping[str, Any] | None
+    unit: str | None
+    pixel_centre: float
+    crop_px: int
+    height: float | None
+    focal: float | None
+    person: tuple[float, float, float, float] | None
+    landmark_noise: float
+    offsets: Mapping[str, int] | None
+    frames: Any
+    fps: float | None
+    up_axis: str | None
+    apply_rotation: bool
+    landmarks: str
+    masks: str
+    hands: bool
+    face: bool
+    setup: bool
+    workers: int
+    overwrite: bool
+    keep_work: bool
+    mediapipe: MediaPipe
+    solve: SolveSettings
+    mask_levels: tuple[float, float]
+    matting: bool
+    scale: float
+    format: str
 
     def __post_init__(self) -> None:
         # Options that must be given.
@@ -103,12 +103,12 @@ class Options(CommandOptions):
             )
         for name in ("fps", "focal"):
             if getattr(self, name) is not None:
-                above(name, getattr(self, name))
+                positive(name, getattr(self, name))
         if self.height is not None:
             between("height", self.height, *PERSON_HEIGHTS)
-        above("landmark_noise", self.landmark_noise)
-        whole("workers", self.workers, 1)
-        above("scale", between("scale", self.scale, 0, 1))
+        positive("landmark_noise", self.landmark_noise)
+        integer("workers", self.workers, 1)
+        positive("scale", between("scale", self.scale, 0, 1))
         one_of("format", self.format, ("jpg", "png"))
         levels = self.mask_levels
         if len(levels) != 2 or not 0 <= levels[0] < levels[1] <= 1:

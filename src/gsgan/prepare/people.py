@@ -19,7 +19,9 @@ from gsgan.utils.errors import DataError
 # Median reprojection error, thousandths of the focal length, above which two cameras show two
 # people: 15 cm at 3 m.
 SAME_PERSON = 50.0
-MIN_JOINTS = 6  # joints that a person has in common with another camera
+MIN_COMMON_JOINTS = (
+    6  # joints that a person has in common with another camera or another frame
+)
 # Steps from frame to frame, in sizes of the person: those of up to this many times the usual step,
 # and of at least this size, cost nothing.
 USUAL_STEPS = 3.0
@@ -127,7 +129,7 @@ def find_jumps(p: Float, time: Float) -> list[int]:
         p: NaN = not seen.
         time: ``[F]`` seconds.
     """
-    rows = np.flatnonzero(is_known(p).sum(1) >= MIN_JOINTS)
+    rows = np.flatnonzero(is_known(p).sum(1) >= MIN_COMMON_JOINTS)
     jumps = []
     for k in range(1, len(rows) - STAYS + 1):
         before = p[rows[max(0, k - STAYS) : k]]
@@ -149,27 +151,27 @@ def _move(before: Float, after: Float) -> float:
     return float(np.linalg.norm(np.median(both, axis=0)))
 
 
-def _only(found: Detections, chosen: Mapping[int, int]) -> Detections:
+def _only(detections: Detections, chosen: Mapping[int, int]) -> Detections:
     """Detections with the person of a number, -1 for nobody, in each row that is listed."""
-    px = found.px.copy()
-    conf = found.conf.copy()
+    px = detections.px.copy()
+    conf = detections.conf.copy()
     for row, person in chosen.items():
         if person < 0:
             px[row] = np.nan
             conf[row] = 0.0
-        elif found.people is not None:
-            px[row], conf[row] = found.people[row][person]
-    return replace(found, px=px, conf=conf, people=None)
+        elif detections.people is not None:
+            px[row], conf[row] = detections.people[row][person]
+    return replace(detections, px=px, conf=conf, people=None)
 
 
 def _people(
-    camera: CameraEntry, found: Detections, row: int | None
+    camera: CameraEntry, detections: Detections, row: int | None
 ) -> list[tuple[Float, Float]]:
     """Undistorted pixels ``[33, 2]`` and confidence ``[33]`` of each person in a frame."""
     if row is None:
         return []
-    alone = [(found.px[row], found.conf[row])]
-    people = alone if found.people is None else found.people[row]
+    alone = [(detections.px[row], detections.conf[row])]
+    people = alone if detections.people is None else detections.people[row]
     result = []
     for px, conf in people:
         seen = is_known(px[:BODY]) & (conf[:BODY] > 0)
@@ -183,17 +185,17 @@ def _groups(
 ) -> list[_Group]:
     """The people of one frame, each with its number in every camera that shows it."""
     # Every two detections of two cameras may be the same person.
-    found: dict[tuple[int, ...], _Group] = {}
+    by_rows: dict[tuple[int, ...], _Group] = {}
     for a, b in combinations(range(len(people)), 2):
         for i in range(len(people[a])):
             for j in range(len(people[b])):
                 group = _group(rig, people, {a: i, b: j})
                 if group is not None:
-                    found[group.chosen] = group
+                    by_rows[group.chosen] = group
 
     # Groups with most confidence first; a detection belongs to one person.
     groups: list[_Group] = []
-    for group in sorted(found.values(), key=lambda one: -one.confidence):
+    for group in sorted(by_rows.values(), key=lambda one: -one.confidence):
         taken = False
         for other in groups:
             for mine, theirs in zip(group.chosen, other.chosen, strict=True):
@@ -215,7 +217,7 @@ def _group(
     for camera, person in pair.items():
         uv[camera], weight[camera] = people[camera][person]
     both = (weight > 0).sum(0) == len(pair)
-    if both.sum() < MIN_JOINTS:
+    if both.sum() < MIN_COMMON_JOINTS:
         return None
     scaled, pixels = rig.normalise(uv)
     p = plain(scaled, pixels, weight)
@@ -258,7 +260,7 @@ def _error(
     for joints in (p, p[list(MEDIAPIPE33.mirror)]):
         errors = scaled.errors(joints, pixels)[0]
         errors = errors[(conf > 0) & np.isfinite(errors)]
-        if len(errors) >= MIN_JOINTS:
+        if len(errors) >= MIN_COMMON_JOINTS:
             smallest = min(smallest, float(np.median(errors)))
     return smallest
 

@@ -233,27 +233,27 @@ def _with_shifts(
 
 
 def with_detections(
-    inputs: Inputs, found: Mapping[str, Path]
+    inputs: Inputs, landmark_files: Mapping[str, Path]
 ) -> tuple[Inputs, dict[str, Detections]]:
     """The inputs with a note on all that is doubtful in the detections, and these by camera.
 
     Args:
         inputs: the cameras.
-        found: by camera, its file or folder of landmarks.
+        landmark_files: by camera, its file or folder of landmarks.
     """
     notes = [*inputs.notes]
     detections = {}
     numbers = {}
     for name in inputs.sources:
-        read = landmarks.read_detections(found[name])
+        read = landmarks.read_detections(landmark_files[name])
         numbers[name] = read.frame_id.tolist()
         detections[name] = in_common(read, inputs.sources[name])
         for note in read.notes:
             notes.append(f"{name}: {note}")
 
         # MediaPipe follows one person, and counts the faces.
-        if found[name].is_file():
-            faces = read_arrays(found[name], ("faces",)).get("faces")
+        if landmark_files[name].is_file():
+            faces = read_arrays(landmark_files[name], ("faces",)).get("faces")
             several = 0 if faces is None else int((faces > 1).sum())
             if faces is not None and several > MAX_OTHER_FACES * len(faces):
                 notes.append(
@@ -264,18 +264,18 @@ def with_detections(
     return _with_shifts(noted, "landmarks", numbers), detections
 
 
-def in_common(found: Detections, source: Recording) -> Detections:
+def in_common(detections: Detections, source: Recording) -> Detections:
     """Detections by the frame numbers that all cameras share, in place of the source's own."""
-    rows = dict(enumerate(found.frame_id.tolist()))
+    rows = dict(enumerate(detections.frame_id.tolist()))
     by_number = renumber({number: row for row, number in rows.items()}, source)
     numbers = np.array(sorted(by_number), np.int64)
     at = [by_number[number] for number in numbers.tolist()]
-    people = found.people
+    people = detections.people
     return replace(
-        found,
+        detections,
         frame_id=numbers,
-        px=found.px[at],
-        conf=found.conf[at],
+        px=detections.px[at],
+        conf=detections.conf[at],
         people=None if people is None else [people[row] for row in at],
     )
 
@@ -568,14 +568,14 @@ def _silhouettes(
 
     # A matte of a room that stands still, or the given masks.
     def study(name: str, advance: Advance) -> Studied:
-        own = [frame - offsets.get(name, 0) for frame in chosen]
+        camera_frames = [frame - offsets.get(name, 0) for frame in chosen]
         advance(0, 1)
         if options.mattes:
             return study_room(
-                sources[name], masks[name], own, options.mask_levels
+                sources[name], masks[name], camera_frames, options.mask_levels
             )
         alphas = {}
-        for number in own:
+        for number in camera_frames:
             mask = read_mask_values(masks[name][number])
             alphas[number] = tidy(mask, options.mask_levels)
         return Studied(None, alphas)

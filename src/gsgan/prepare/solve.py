@@ -41,7 +41,7 @@ from gsgan.skeleton.joints import (
     is_known,
 )
 from gsgan.utils.arrays import Bool, Float, Ints, nanmedian
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import at_least, integer, positive
 
 # Errors and distances are in thousandths of the focal length.
 WRIST_SCALE = 40.0  # distance from the pose's wrist at which a hand counts half
@@ -89,9 +89,9 @@ def match_hands(
     )
 
     # A hand is left out if one wrist is unknown: its distances cannot be compared.
-    known = np.isfinite(distance).all(-1, keepdims=True)
+    has_distance = np.isfinite(distance).all(-1, keepdims=True)
     loss = HAND * root_weight * np.log1p((distance / WRIST_SCALE) ** 2)
-    loss = np.where(known, loss, 0.0)
+    loss = np.where(has_distance, loss, 0.0)
 
     # What keeping or swapping the hands costs, by their distances to the
     # wrists.
@@ -125,21 +125,21 @@ def misfits(error: Float) -> Bool:
 class SolveSettings:
     """Settings of the solution, see conf/prepare.yaml."""
 
-    min_confidence: float = 0.1  # of a detection
-    refinements: int = 3  # number of rounds
-    rotation_prior: float = 2.0  # standard deviation, degrees
-    position_prior: float = 0.05  # standard deviation, metres
-    smoothing: float = 0.02  # seconds
-    body: bool = True  # joints are those of one body in smooth motion
+    min_confidence: float  # of a detection
+    refinements: int  # number of rounds
+    rotation_prior: float  # standard deviation, degrees
+    position_prior: float  # standard deviation, metres
+    smoothing: float  # seconds
+    body: bool  # joints are those of one body in smooth motion
     # standard deviation of a landmark, thousandths of the focal length
-    noise: float = 2.0
+    noise: float
 
     def __post_init__(self) -> None:
-        whole("solve.refinements", self.refinements, 0)
-        above("solve.rotation_prior", self.rotation_prior)
-        above("solve.position_prior", self.position_prior)
+        integer("solve.refinements", self.refinements, 0)
+        positive("solve.rotation_prior", self.rotation_prior)
+        positive("solve.position_prior", self.position_prior)
         at_least("solve.smoothing", self.smoothing, 0)
-        above("solve.noise", self.noise)
+        positive("solve.noise", self.noise)
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ class Refined(NamedTuple):
 
 def refine(
     given: CameraArray,
-    found: Corrected,
+    corrected: Corrected,
     outlines: Sequence[Sequence[Outline | None]],
     settings: SolveSettings,
 ) -> Refined:
@@ -302,7 +302,7 @@ def refine(
 
     Args:
         given: ``C`` cameras.
-        found: landmarks of F frames, seen by these cameras.
+        corrected: landmarks of F frames, seen by these cameras.
         outlines: of each camera in each frame.
         settings: number of rounds, and the priors.
     """
@@ -322,13 +322,13 @@ def refine(
     best = given
     lowest = np.nan
     limit = CONTRADICTED * np.maximum(
-        _landmark_errors(given, found), USUAL_ERROR
+        _landmark_errors(given, corrected), USUAL_ERROR
     )
     for weight in LANDMARK_WEIGHTS:
         cameras = _refine_cameras(
-            given, found, fitted, some[::2], weight, settings
+            given, corrected, fitted, some[::2], weight, settings
         )
-        if (_landmark_errors(cameras, found) > limit).any():
+        if (_landmark_errors(cameras, corrected) > limit).any():
             continue
         after = float(np.nanmedian(frontier_points(cameras, judging).error))
         if np.isnan(lowest) or after < lowest:
@@ -339,17 +339,17 @@ def refine(
     return Refined(best, (error, lowest))
 
 
-def _landmark_errors(cameras: CameraArray, found: Corrected) -> Float:
+def _landmark_errors(cameras: CameraArray, corrected: Corrected) -> Float:
     """The median error ``[C]`` of the body's landmarks, thousandths of the focal length."""
-    uv = _flat(found.uv[:, :, :BODY])
+    uv = _flat(corrected.uv[:, :, :BODY])
     unit, _ = cameras.normalise(uv)
-    points = robust(unit, uv, _flat(found.weight[:, :, :BODY]))
+    points = robust(unit, uv, _flat(corrected.weight[:, :, :BODY]))
     return nanmedian(points.error, -1)
 
 
 def _refine_cameras(
     given: CameraArray,
-    found: Corrected,
+    corrected: Corrected,
     outlines: Sequence[Sequence[Outline | None]],
     frames: Sequence[int],
     landmark_weight: float,
@@ -359,8 +359,8 @@ def _refine_cameras(
     # Pixels are those of one focal length.
     at = np.array(frames)
     to_unit = (UNIT_FOCAL / given.focal)[:, None, None]
-    landmarks = _flat(found.uv[:, at, :BODY])
-    weight = landmark_weight * _flat(found.weight[:, at, :BODY])
+    landmarks = _flat(corrected.uv[:, at, :BODY])
+    weight = landmark_weight * _flat(corrected.weight[:, at, :BODY])
     unit, _ = given.normalise(landmarks)
 
     # The prior pulls towards the given cameras, not towards those of the last round.
@@ -405,10 +405,16 @@ def correct(
 
     # If a camera does not see a wrist, the other cameras show where it is.
     sees_wrist = weight[..., WRIST_JOINTS, None] > 0
-    own = np.where(sees_wrist, sided[:, :, WRIST_JOINTS], np.nan)
-    arms = robust(cameras, _flat(own), _flat(weight[:, :, WRIST_JOINTS]))
+    wrists_seen = np.where(sees_wrist, sided[:, :, WRIST_JOINTS], np.nan)
+    arms = robust(
+        cameras, _flat(wrists_seen), _flat(weight[:, :, WRIST_JOINTS])
+    )
     projected, _ = cameras.project(arms.p)
-    wrists = np.where(np.isfinite(own), own, projected.reshape(own.shape))
+    wrists = np.where(
+        np.isfinite(wrists_seen),
+        wrists_seen,
+        projected.reshape(wrists_seen.shape),
+    )
 
     # Sides of the hands.
     swapped = match_hands(

@@ -15,7 +15,7 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.joints import BODY, FACE, HANDS, is_known
 from gsgan.utils.arrays import Float
 
-TURNED = 1e-4  # degrees: less is rounding of cameras that were kept
+MIN_TURN = 1e-4  # degrees: less is rounding of cameras that were kept
 DELAY = 0.5  # frames: larger delays of a clock are noted
 # Frames: a clock that is so late is an error. Whole offsets leave half a frame, and landmarks
 # themselves can make a clock seem three quarters of one late.
@@ -91,7 +91,7 @@ def _camera_notes(solution: Solution, turned: Float) -> list[str]:
     given, refined = solution.frontier
     if not np.isfinite(given):
         return []
-    if turned.max() > TURNED:
+    if turned.max() > MIN_TURN:
         return [
             f"the cameras were refined: silhouettes of two cameras now agree within {refined:.2f} "
             f"pixels (median), with the given calibration {given:.2f}"

@@ -29,7 +29,7 @@ from gsgan.run.drive import (
 from gsgan.run.runs import Run, RunReference, marks_of
 from gsgan.scene import Camera, cat
 from gsgan.skeleton.training_poses import TrainingPoses
-from gsgan.utils.checks import above, whole
+from gsgan.utils.checks import integer, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console, track
 from gsgan.utils.errors import ConfigError, DataError
@@ -72,7 +72,7 @@ def render(options: RenderOptions) -> None:
     # Options are checked before the run is loaded.
     output = _output(options)
     paint_on = background(str(options.background), output.video)
-    fps = float(above("fps", options.fps))
+    fps = float(positive("fps", options.fps))
     run = options.source.load()
     if options.distilled:
         run.avatar = distil_run(options.driven, run)
@@ -140,14 +140,14 @@ def _output(options: RenderOptions) -> Output:
             f"out={out} must be a .mp4 file, or a folder for PNG files"
         )
     return Output(
-        out, float(above("fps", options.fps)), bool(options.provenance)
+        out, float(positive("fps", options.fps)), bool(options.provenance)
     )
 
 
 def _choose(drive: Drive, options: RenderOptions, fps: float) -> Drive:
     """``frames`` frames from ``start`` on; a single pose is held."""
     # The first frame must exist.
-    start = whole("start", options.start, 0)
+    start = integer("start", options.start, 0)
     total = len(drive.p)
     if start >= total:
         raise ConfigError(
@@ -158,7 +158,7 @@ def _choose(drive: Drive, options: RenderOptions, fps: float) -> Drive:
     still = total == 1 and drive.camera is None
     count = round(STILL_SECONDS * fps) if still else total - start
     if options.frames is not None:
-        count = whole("frames", options.frames, 1)
+        count = integer("frames", options.frames, 1)
         count = count if still else min(count, total - start)
     if still:
         return drive.rows(np.zeros(count, np.int64))
@@ -178,12 +178,12 @@ def _cameras(
         camera, index = drive.camera
         if options.pixels is not None:
             height, width = camera.size
-            side = whole("pixels", options.pixels, 1)
+            side = integer("pixels", options.pixels, 1)
             camera = camera.resize((side, round(side * width / height)))
         return camera, index
 
     # All others give square images, by default as large as in training.
-    size = whole("pixels", options.pixels or trained or 512, 1)
+    size = integer("pixels", options.pixels or trained or 512, 1)
     name = "orbit" if options.camera is None else str(options.camera)
     if name == "orbit":
         orbit = Orbit(**options.orbit)
@@ -229,9 +229,9 @@ def of_entry(
     window = square_window(entry.size)
     if crop is not None:
         joints = p.reshape(-1, 3)
-        known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
+        has_place: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
         kept = lens and entry.keeps_lens
-        window = crop.window(entry, joints, known, lens=kept)
+        window = crop.window(entry, joints, has_place, lens=kept)
     return entry.view_of(window, (size, size), lens=lens)
 
 

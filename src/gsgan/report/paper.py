@@ -82,8 +82,8 @@ class PaperTable:
         for row in self.rows:
             for subject, values in row["values"].items():
                 printed[f"{row['label']}, {subject}"] = values
-        known = set().union(*printed.values())
-        shown = [metric for metric in METRICS if metric in known]
+        measured = set().union(*printed.values())
+        shown = [metric for metric in METRICS if metric in measured]
         rows = []
         for label, values in printed.items():
             rows.append(self._row(label, map(values.get, shown)))

@@ -223,8 +223,10 @@ def read_run(folder: Path, *, scored: bool = True) -> ScoredRun:
         )
 
         # Figures may show runs that are not scored.
-        found = folder / FACTS_FILE
-        facts = json.loads(found.read_text()) if found.is_file() else {}
+        facts_path = folder / FACTS_FILE
+        facts = (
+            json.loads(facts_path.read_text()) if facts_path.is_file() else {}
+        )
         settings = _read_settings(folder)
         hydra = hydra_record(folder)
         chosen = OmegaConf.select(hydra, "hydra.runtime.choices") or {}

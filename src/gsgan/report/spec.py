@@ -72,7 +72,7 @@ class TableSpec:
             object.__setattr__(self, "subjects", list(map(str, self.subjects)))
 
         # Each list has known values only, and all but one list must have some.
-        for key, known, values in (
+        for key, allowed, values in (
             ("metrics", METRICS, self.metrics),
             ("splits", SPLITS, self.splits),
             ("variants", (FULL, SPLAT), variants),
@@ -81,4 +81,4 @@ class TableSpec:
             if not values and key != "times_1000":
                 raise ConfigError(f"table.{key} must be a list of at least one")
             for value in values:
-                one_of(f"table.{key}", value, known)
+                one_of(f"table.{key}", value, allowed)

@@ -179,7 +179,7 @@ class Part:
             axis=1, skipna=False
         )
         whole = means.groupby(level=names[:2]).transform(
-            lambda own: own.notna().all()
+            lambda values: values.notna().all()
         )
         mean = (
             means.where(whole).rename("value").reset_index().assign(column=MEAN)
@@ -193,7 +193,7 @@ class Part:
         """Mean ± sample standard deviation (n - 1) over seeds; one seed has no spread."""
         at = self.scores
         metric = self.columns[column]
-        own = at[
+        scores = at[
             (at["name"] == name)
             & (at.variant == variant)
             & (at.column == column)
@@ -201,14 +201,16 @@ class Part:
 
         # A note names its seeds unless it is about all of them.
         notes = []
-        for note, few in own.groupby("note", sort=False):
+        for note, few in scores.groupby("note", sort=False):
             seeds = (
-                "" if len(few) == len(own) else f"seed {', '.join(few.seed)}: "
+                ""
+                if len(few) == len(scores)
+                else f"seed {', '.join(few.seed)}: "
             )
             notes.append(f"{seeds}{note}")
 
         # Without a value, the notes tell why.
-        values = own.value.dropna()
+        values = scores.value.dropna()
         if values.empty:
             reasons = notes or ["no scored run"]
             return Cell(
@@ -224,7 +226,7 @@ class Part:
             text += f" ± {self.write_value(metric, spread)}"
 
         # The deviation over poses is a mean over seeds.
-        poses = own.poses.mean()
+        poses = scores.poses.mean()
         if not pd.isna(poses):
             text += f" ({self.write_value(metric, float(poses))})"
         return Cell(text, mean, spread, tuple(notes))

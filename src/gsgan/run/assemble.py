@@ -154,6 +154,10 @@ class AvatarSettings(CommandOptions):
     seed: int
     effects: EffectSettings | None = None
 
+    def with_backend(self, backend: str) -> AvatarSettings:
+        """The settings with another rasteriser of F and S."""
+        return replace(self, model=replace(self.model, backend=backend))
+
     @property
     def moves_with_body(self) -> bool:
         """Whether parts move with a skinned body, if the data has one."""
@@ -178,8 +182,10 @@ class RunSettings(CommandOptions):
         """The settings of a config."""
         # Images are undistorted when they are read, so the dataset knows that effect.
         avatar = AvatarSettings.from_config(config)
-        settings = avatar.effects or EffectSettings()
-        distortion = settings.value_of("distortion")
+        effects = avatar.effects
+        distortion = (
+            "auto" if effects is None else effects.value_of("distortion")
+        )
         return cls(avatar, build(config.data, distortion=distortion))
 
 

@@ -249,8 +249,8 @@ def _from_the_nearest(
     vertices: Tensor, labels: Tensor, decided: Tensor
 ) -> Tensor:
     """Labels ``[V]``, those not decided taken from the nearest decided vertex."""
-    known = decided.nonzero().squeeze(-1)
-    _, nearest = cKDTree(vertices[known]).query(vertices[~decided])
+    labelled = decided.nonzero().squeeze(-1)
+    _, nearest = cKDTree(vertices[labelled]).query(vertices[~decided])
     labels = labels.clone()
-    labels[~decided] = labels[known[nearest]]
+    labels[~decided] = labels[labelled[nearest]]
     return labels

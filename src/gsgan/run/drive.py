@@ -47,7 +47,7 @@ from gsgan.skeleton.proportions import (
 )
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, between, one_of
+from gsgan.utils.checks import between, one_of, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -124,7 +124,7 @@ class MotionOptions(CommandOptions):
     animation: str | int | None = None
 
     def __post_init__(self) -> None:
-        above("transition", self.transition)
+        positive("transition", self.transition)
         between("min_visibility", self.min_visibility, 0, 1)
         one_of("drive", self.drive, (None, "skeleton"))
         one_of("retarget", self.retarget, ("auto", True, False))
@@ -210,8 +210,8 @@ def _read_split(options: MotionOptions, run: Run, split: str) -> Drive:
     # the frames of the first camera. YAML reads a name like "7" as a number.
     first = dataset.items[0][0]
     camera = first if options.camera is None else str(options.camera)
-    own = camera in dict(dataset.items)
-    shown = camera if own else first
+    in_split = camera in dict(dataset.items)
+    shown = camera if in_split else first
     items = [item for item in dataset.items if item[0] == shown]
     frames = [frame for _, frame in items]
 
@@ -230,7 +230,7 @@ def _read_split(options: MotionOptions, run: Run, split: str) -> Drive:
     # The camera of each frame, with its index for the colour correction.
     text = f"{split}: {len(frames)} frames"
     seen = None
-    if own:
+    if in_split:
         text += f" of camera {camera}"
         index = torch.tensor([layout.camera_names.index(shown)] * len(items))
         cameras = [dataset.camera(item) for item in items]
@@ -301,20 +301,24 @@ def _from_file(
 
     # The user's rate comes before the file's, but the file's up axis before the user's.
     rate = options.motion_fps or motion.fps
-    rate = float(above("motion_fps", rate)) if rate else FPS
+    rate = float(positive("motion_fps", rate)) if rate else FPS
     up = None if motion.file_up else options.up
     up = up or motion.up or up_axis(motion)
 
     # Bones that are the subject's own already are left as they are. A list of motions is
     # always retargeted, because transitions need every joint.
-    own = not options.retarget
+    fits_bones = not options.retarget
     if options.retarget == "auto":
-        own = is_own(motion, run.proportions)
-    own = own and not motion.detached and not isinstance(options.motion, list)
+        fits_bones = is_own(motion, run.proportions)
+    fits_bones = (
+        fits_bones
+        and not motion.detached
+        and not isinstance(options.motion, list)
+    )
 
     # Joints are interpolated in time; visibility and body pose are of the nearest frame.
     body = None
-    if own:
+    if fits_bones:
         nearest = np.rint(frame_times(len(motion), rate, fps)).astype(int)
         p = resample(motion.p, rate, fps)
         visibility = motion.visibility[nearest]
@@ -325,7 +329,7 @@ def _from_file(
         visibility = _make_visibility(p, run.proportions)
 
     # One line on what was read and what was made of it.
-    bones = "bones as they are" if own else "on the subject's bones"
+    bones = "bones as they are" if fits_bones else "on the subject's bones"
     assumed = (
         ""
         if options.motion_fps or motion.fps
@@ -414,13 +418,13 @@ def _hands_and_face(p: Float) -> str:
     if p.shape[1] <= BODY:
         return ""
     left, right = HAND_JOINTS.values()
-    known = np.isfinite(p)
+    has_place = np.isfinite(p)
     text = (
-        f", left hand in {known[:, left].all((1, 2)).sum()} frames, "
-        f"right hand in {known[:, right].all((1, 2)).sum()}"
+        f", left hand in {has_place[:, left].all((1, 2)).sum()} frames, "
+        f"right hand in {has_place[:, right].all((1, 2)).sum()}"
     )
     if p.shape[1] > FACE.start:
-        text += f", face in {known[:, FACE].any((1, 2)).sum()}"
+        text += f", face in {has_place[:, FACE].any((1, 2)).sum()}"
     return text
 
 

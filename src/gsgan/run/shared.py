@@ -179,7 +179,7 @@ def check_config(path: Path, plain: Any) -> DictConfig:
     shipped = "\n".join(
         file.read_text() for file in config_folder().rglob("*.yaml")
     )
-    known = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
+    targets = {"", *re.findall(r"_target_: *([\w.]+)", shipped)}
 
     # Every value of the config is visited, however deep it lies.
     config = OmegaConf.create(plain)
@@ -191,7 +191,7 @@ def check_config(path: Path, plain: Any) -> DictConfig:
         if isinstance(node, list):
             pending += node
         elif isinstance(node, dict):
-            if node.get("_target_", "") not in known:
+            if node.get("_target_", "") not in targets:
                 raise DataError(
                     f"{path} names {node['_target_']!r}, which is not a class of gsgan's own "
                     "configs; such an avatar is used by its run folder alone"

@@ -14,7 +14,7 @@ from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
 from gsgan.skeleton.holistic import named_template
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import Swing, check_skeleton, constants
-from gsgan.utils.checks import above, one_of, whole
+from gsgan.utils.checks import integer, one_of, positive
 from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
@@ -105,9 +105,9 @@ class Points:
 
 def rows_of(values: Tensor, chosen: Tensor) -> Tensor:
     """``[B, M, ...]``: the rows ``[B, M]`` of each item of ``values [B, N, ...]``."""
-    own = values.shape[2:]
-    index = chosen.view(*chosen.shape, *(1 for _ in own))
-    return values.gather(1, index.expand(*chosen.shape, *own))
+    row_shape = values.shape[2:]
+    index = chosen.view(*chosen.shape, *(1 for _ in row_shape))
+    return values.gather(1, index.expand(*chosen.shape, *row_shape))
 
 
 class Densify(nn.Module):
@@ -183,20 +183,20 @@ class Densify(nn.Module):
             points_per_finger_bone,
         )
         for name, count in zip(COUNT_NAMES, counts, strict=True):
-            whole(f"Densify: {name}", count, 1)
+            integer(f"Densify: {name}", count, 1)
 
         # The options that scale the shapes.
         self.template = named_template(template)
         self.counts = counts
-        self.radius_ratio = above("Densify: radius_ratio", radius_ratio)
-        self.finger_radius_ratio = above(
+        self.radius_ratio = positive("Densify: radius_ratio", radius_ratio)
+        self.finger_radius_ratio = positive(
             "Densify: finger_radius_ratio", finger_radius_ratio
         )
-        self.face_radius_scale = above(
+        self.face_radius_scale = positive(
             "Densify: face_radius_scale", face_radius_scale
         )
         self.torso = one_of("Densify: torso", torso, get_args(Torso))
-        self.sigma = above("Densify: sigma", sigma)
+        self.sigma = positive("Densify: sigma", sigma)
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
 
     @property

@@ -103,25 +103,25 @@ def bone_frames(
     q = p - p[:, template.hips[0], None].detach()
     trunk = _trunk(q, c)
     chest = trunk[:, 1]
-    known = torch.cat([trunk[:, :2], _head(q, valid, chest, c)], dim=1)
+    frames = torch.cat([trunk[:, :2], _head(q, valid, chest, c)], dim=1)
     if template.palms:
-        known = torch.cat([known, palms_of(q, chest.unsqueeze(1), c)], dim=1)
+        frames = torch.cat([frames, palms_of(q, chest.unsqueeze(1), c)], dim=1)
 
     # Limbs, level by level: each parent's frame is known before.
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
     relative = []
     for level in c.levels:
-        parent = known.index_select(1, level.parents)
+        parent = frames.index_select(1, level.parents)
         swing = swings(bones.index_select(1, level.limbs), parent, level)
         relative.append(swing)
-        known = torch.cat([known, parent @ swing], dim=1)
+        frames = torch.cat([frames, parent @ swing], dim=1)
 
     # The lengths of the bones never reach zero, so that their gradient is finite.
     length2 = squared_norm(bones)
     lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
     return BoneFrames(
-        hubs=known[:, : template.n_hubs],
-        limbs=known[:, template.n_hubs :].index_select(1, c.limb_order),
+        hubs=frames[:, : template.n_hubs],
+        limbs=frames[:, template.n_hubs :].index_select(1, c.limb_order),
         local=torch.cat(relative, dim=1).index_select(1, c.limb_order),
         lengths=lengths,
         torso=trunk[:, 2],

@@ -216,22 +216,22 @@ def _fill(
 
     # Trunk and head. Joints that are placed later move none of their frames.
     q = _complete_trunk(q, valid, template, c)
-    known = hubs_of(q, valid, c)
-    q = _complete_face(q, valid, template, known, scale)
+    so_far = hubs_of(q, valid, c)
+    q = _complete_face(q, valid, template, so_far, scale)
 
     # Limbs, level by level.
     for level, bones in zip(
         c.levels, _bones(template, p.device, p.dtype), strict=True
     ):
         if template.palms:  # their knuckles may have been placed
-            hubs, _, limbs = known.tensor_split(
+            hubs, _, limbs = so_far.tensor_split(
                 (N_HUBS, template.n_hubs), dim=1
             )
             palms = palms_of(q, hubs[:, CHEST : CHEST + 1], c)
-            known = torch.cat([hubs, palms, limbs], dim=1)
+            so_far = torch.cat([hubs, palms, limbs], dim=1)
 
         # Joints at the ends of their rest bones.
-        frames = known.index_select(1, bones.frames)
+        frames = so_far.index_select(1, bones.frames)
         bone = matvec(frames, bones.rest) * scale[:, None, None]
         q = _put(q, valid, bones.ends, q.index_select(1, bones.starts) + bone)
         if template.bare:
@@ -240,12 +240,12 @@ def _fill(
 
         # The frames of this level's limbs, for the next one.
         if level is not c.levels[-1]:
-            parent = known.index_select(1, level.parents)
+            parent = so_far.index_select(1, level.parents)
             starts = c.starts[level.limbs]
             ends = c.ends[level.limbs]
             directions = q.index_select(1, ends) - q.index_select(1, starts)
-            known = torch.cat(
-                [known, parent @ swings(directions, parent, level)], dim=1
+            so_far = torch.cat(
+                [so_far, parent @ swings(directions, parent, level)], dim=1
             )
     return torch.where(is_seen, p, q + root)
 
@@ -276,7 +276,7 @@ def _bones(
         at_rest = bone_frames(c.rest.unsqueeze(0), None, template)
         rest_frames = torch.cat([at_rest.hubs, at_rest.limbs], dim=1)[0]
         tree = set(template.incoming.values())
-        found = []
+        level_bones = []
         for level, tensors in zip(template.levels, c.levels, strict=True):
             # The limbs that place the joint at their end, which another limb may share.
             placed = []
@@ -297,7 +297,7 @@ def _bones(
             starts = c.starts[limbs]
             ends = c.ends[limbs]
             bones = (c.rest[ends] - c.rest[starts]).unsqueeze(-1)
-            found.append(
+            level_bones.append(
                 _Bones(
                     frames=tensors.parents[placed],
                     starts=starts,
@@ -307,7 +307,7 @@ def _bones(
                     same=index(same),
                 )
             )
-        return tuple(found)
+        return tuple(level_bones)
 
 
 def _same_bone(template: SkeletonTemplate, bare: int) -> int:

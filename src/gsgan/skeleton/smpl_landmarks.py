@@ -152,9 +152,9 @@ def to_mediapipe33(
             put(name, (j[..., joint, :] + v[..., vertex, :]) / 2, NEARBY)
 
     # A landmark with a coordinate that is not finite is unknown.
-    known = np.isfinite(p).all(axis=-1)
-    p[~known] = np.nan
-    return p, np.where(known, conf, 0.0)
+    is_finite = np.isfinite(p).all(axis=-1)
+    p[~is_finite] = np.nan
+    return p, np.where(is_finite, conf, 0.0)
 
 
 def _points(name: str, points: ArrayLike, count: int) -> Floats:

@@ -249,8 +249,10 @@ def _cpu() -> str:
             "CPU part",
             "Features",
         )
-        found = info.read_text(errors="replace").splitlines()
-        lines += sorted({line for line in found if line.startswith(fields)})
+        info_lines = info.read_text(errors="replace").splitlines()
+        lines += sorted(
+            {line for line in info_lines if line.startswith(fields)}
+        )
     return "\n".join(lines)
 
 

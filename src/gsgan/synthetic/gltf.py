@@ -45,7 +45,7 @@ Z_UP = np.array(
         [0, 0, 0, 1],
     ]
 )
-USUAL = 1.7  # metres, the height of a person of an unknown unit
+USUAL_HEIGHT_METRES = 1.7  # metres, the height of a person of an unknown unit
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
 UNIT_LENGTHS = (
     1.0,
@@ -54,7 +54,7 @@ UNIT_LENGTHS = (
     0.0254,
 )  # metres per unit of a file, likeliest first
 # Beginnings of the names of extensions that are applied, or change only how light is reflected.
-KNOWN = (
+READ_EXTENSIONS = (
     BASISU,
     DRACO,
     "EXT_meshopt_compression",
@@ -98,7 +98,7 @@ def read_character(path: Path) -> Character:
             f"{path}: no such file; expected a rigged character as .glb"
         )
     try:
-        glb = GltfFile(path, known=KNOWN)
+        glb = GltfFile(path, extensions=READ_EXTENSIONS)
         return _character(glb, _Skeleton(glb))
     except FILE_ERRORS as error:
         reason = str(error).split("\n")[0] or type(error).__name__
@@ -641,12 +641,12 @@ def _standing(skeleton: _Skeleton, vertices: Array) -> _Standing:
             scale = unit
             break
     if scale == 0:
-        scale = USUAL / height
+        scale = USUAL_HEIGHT_METRES / height
         logger.warning(
             "%s: a height of %.3g fits no unit and is scaled to %.1f m",
             skeleton.glb.path,
             height,
-            USUAL,
+            USUAL_HEIGHT_METRES,
         )
 
     # The hips are over the origin, the lowest vertex is on the floor.

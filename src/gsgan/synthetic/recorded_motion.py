@@ -220,16 +220,18 @@ def _hold_foot(
     return _between(np.concatenate(shift), at, np.arange(len(ball)))
 
 
-def _between(values: Array, known: NDArray[Any], times: NDArray[Any]) -> Array:
+def _between(
+    values: Array, key_times: NDArray[Any], times: NDArray[Any]
+) -> Array:
     """``[F, C]`` values known at some times, interpolated linearly."""
-    return np.stack([np.interp(times, known, x) for x in values.T], axis=1)
+    return np.stack([np.interp(times, key_times, x) for x in values.T], axis=1)
 
 
-def _interpolate(turns: Array, known: Array, times: Array) -> Array:
+def _interpolate(turns: Array, key_times: Array, times: Array) -> Array:
     """``[F, 3, 3]`` rotations known at some times, interpolated along the shortest way."""
-    if len(known) == 1:
+    if len(key_times) == 1:
         return np.repeat(turns, len(times), axis=0)
-    between = Slerp(known, Rotation.from_matrix(turns))
+    between = Slerp(key_times, Rotation.from_matrix(turns))
     return np.asarray(between(times).as_matrix())
 
 

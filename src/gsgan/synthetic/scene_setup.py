@@ -26,7 +26,7 @@ from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.takes import MOTIONS
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
 from gsgan.utils.arrays import as_floats
-from gsgan.utils.checks import between, one_of, whole
+from gsgan.utils.checks import between, integer, one_of
 from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -142,7 +142,7 @@ class SceneSettings:
     def __post_init__(self) -> None:
         # Whole numbers.
         for name, minimum in MIN_VALUES.items():
-            whole(f"data.source.{name}", getattr(self, name), minimum)
+            integer(f"data.source.{name}", getattr(self, name), minimum)
 
         # Numbers that may be None; 0 disables the effect too.
         for name, bounds in OPTIONAL_NUMBERS.items():

@@ -71,10 +71,10 @@ def ensure_scene(
         ConfigError: on an unknown parameter or one out of range.
         DataError: when the folder cannot be written.
     """
-    known = [field.name for field in fields(SceneSettings)]
-    if unknown := sorted(set(parameters) - set(known)):
+    allowed = [field.name for field in fields(SceneSettings)]
+    if unknown := sorted(set(parameters) - set(allowed)):
         raise ConfigError(
-            f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
+            f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(allowed)}"
         )
 
     # The name of the folder identifies the content.

@@ -229,9 +229,9 @@ class Secondary:
             return np.zeros(W)
 
         # Share of the label among the faces around each vertex.
-        own = np.repeat(c.labels == c.label_names.index(label), 3)
+        has_label = np.repeat(c.labels == c.label_names.index(label), 3)
         faces = np.bincount(self._corner, minlength=W)
-        share = np.bincount(self._corner, own, W) / np.maximum(faces, 1)
+        share = np.bincount(self._corner, has_label, W) / np.maximum(faces, 1)
 
         # Smoothing over each vertex and its neighbours along the edges.
         start = self._corner
@@ -317,16 +317,16 @@ class Secondary:
         """Pose-independent part of the wrinkles: each vertex has the folds of its nearest joint."""
         x = self._rest
         index = self._index
-        known = []
+        creases = []
         for crease in CREASES:
             if {crease.bone, crease.base, crease.end} <= index.keys():
-                known.append(crease)
+                creases.append(crease)
 
-        self._bends = np.zeros((len(known), 2), np.int64)
-        self._axis = np.zeros((len(known), 3))
-        near = np.zeros((len(known), len(x)))
-        phase = np.zeros((len(known), len(x)))
-        for k, crease in enumerate(known):
+        self._bends = np.zeros((len(creases), 2), np.int64)
+        self._axis = np.zeros((len(creases), 3))
+        near = np.zeros((len(creases), len(x)))
+        phase = np.zeros((len(creases), len(x)))
+        for k, crease in enumerate(creases):
             # The limb's axis, and coordinates along and across it.
             joint = self.character.joints[index[crease.bone]]
             axis = unit(self.character.joints[index[crease.end]] - joint)
@@ -350,7 +350,7 @@ class Secondary:
         # Folds belong to the nearest joint, and vanish where two joints are equally near.
         self._own = np.zeros(len(x), np.int64)
         self._phase = np.zeros(len(x))
-        if known:
+        if creases:
             self._own = near.argmax(axis=0)
             self._phase = phase[self._own, np.arange(len(x))]
         ordered = np.sort(np.vstack([np.zeros((2, len(x))), near]), axis=0)

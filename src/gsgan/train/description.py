@@ -138,12 +138,12 @@ def _gaussians(module: AvatarTraining, data: GsganData) -> list[Row]:
             )
         )
         rows += _advice(module, len(on_body.points), scale)
-    if module.registered is not None:
-        metres = module.registered.offsets.norm(dim=2).median()
+    if module.surface_offsets is not None:
+        metres = module.surface_offsets.offsets.norm(dim=2).median()
         rows.append(
             (
                 "registration",
-                f"{len(module.registered)} frames; their surface is "
+                f"{len(module.surface_offsets)} frames; their surface is "
                 f"{1000 * float(metres):.0f} mm (median) from where their poses put it",
             )
         )

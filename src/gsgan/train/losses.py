@@ -15,11 +15,11 @@ from gsgan.losses.adversarial import (
     generator_loss,
 )
 from gsgan.losses.perceptual import Perceptual, crop_person
-from gsgan.losses.photometric import photometric, without_unsure
+from gsgan.losses.photometric import photometric, without_ignored
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
-from gsgan.utils.checks import at_least, between, one_of, whole
+from gsgan.utils.checks import at_least, between, integer, one_of
 from gsgan.utils.tensors import full_precision
 
 
@@ -29,7 +29,7 @@ class StepOneLoss:
 
     Args:
         l1, ssim: weights (paper: 0.8, 0.2).
-        feature_head, alpha, perceptual: weights, see conf/training/long.yaml; 0 builds no readout
+        feature_head, alpha, perceptual: weights, see conf/training/_base.yaml; 0 builds no readout
             of F, and no perceptual network for Step I.
         perceptual_from: share of Step I without the perceptual loss.
         perceptual_every: iterations from one perceptual loss to the next.
@@ -47,7 +47,7 @@ class StepOneLoss:
 
     def __post_init__(self) -> None:
         at_least("training.step_one.perceptual", self.perceptual, 0)
-        whole("training.step_one.perceptual_every", self.perceptual_every, 1)
+        integer("training.step_one.perceptual_every", self.perceptual_every, 1)
         between("training.step_one.perceptual_from", self.perceptual_from, 0, 1)
 
     def __call__(
@@ -74,7 +74,10 @@ class StepOneLoss:
             # Step I's colour.
             pixels = {"l1": self.l1, "ssim": self.ssim}
             loss = photometric(
-                rendering.colour + behind, target, unsure=frame.unsure, **pixels
+                rendering.colour + behind,
+                target,
+                ignored=frame.ignored,
+                **pixels,
             )
             if head is not None:
                 assert head.bias is not None
@@ -88,7 +91,7 @@ class StepOneLoss:
                 )
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
-                    read + behind, target, unsure=frame.unsure, **pixels
+                    read + behind, target, ignored=frame.ignored, **pixels
                 )
 
             # Alpha has the mask as its target where no background supervises it.
@@ -98,7 +101,7 @@ class StepOneLoss:
                     frame.mask,
                     l1=1.0,
                     ssim=0.0,
-                    unsure=frame.unsure,
+                    ignored=frame.ignored,
                 )
                 loss = loss + self.alpha * matte
             return loss
@@ -109,7 +112,7 @@ def perceptual_distance(
 ) -> Tensor:
     """L_perc of an image ``[B, 3, H, W]`` of a frame, or of crops that ``draws`` place."""
     # Unsure pixels of the target show the image itself.
-    target = without_unsure(frame.image, image, frame.unsure)
+    target = without_ignored(frame.image, image, frame.ignored)
     compared = [image, target]
 
     # Slow networks compare squares of the person alone.
@@ -214,7 +217,7 @@ class _Through(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class StepTwoLoss:
-    """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
+    """Weights of the generator's loss (conf/training/_base.yaml); 0 computes no term.
 
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat.
     """
@@ -237,7 +240,7 @@ class StepTwoLoss:
 
     def __post_init__(self) -> None:
         one_of("training.step_two.gan", self.gan, FORMS)
-        whole("training.step_two.perceptual_every", self.perceptual_every, 1)
+        integer("training.step_two.perceptual_every", self.perceptual_every, 1)
 
     def discriminator_maps(
         self, discriminator: Discriminator, rendering: Rendering, frame: Frame
@@ -245,7 +248,7 @@ class StepTwoLoss:
         """The discriminator's maps of a rendering of ``frame``."""
         # Unsure pixels show the image itself in the target.
         assert rendering.image is not None
-        target = without_unsure(frame.image, rendering.image, frame.unsure)
+        target = without_ignored(frame.image, rendering.image, frame.ignored)
         return DiscriminatorMaps(
             discriminator, rendering.image, target, self.gan
         )
@@ -281,7 +284,7 @@ class StepTwoLoss:
         image = rendering.image
         alpha = rendering.alpha
         assert image is not None and alpha is not None  # noqa: PT018
-        target = without_unsure(frame.image, image, frame.unsure)
+        target = without_ignored(frame.image, image, frame.ignored)
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
         terms = {"photometric": by_pixel(image, target)}
 
@@ -290,7 +293,7 @@ class StepTwoLoss:
             white = image + 1 - alpha
             truth = frame.image + 1 - frame.mask
             terms["alpha"] = self.alpha * by_pixel(
-                white, truth, unsure=frame.unsure
+                white, truth, ignored=frame.ignored
             )
 
         # L_Ψ and L_perc, which is weighted as much more as it is computed less often.

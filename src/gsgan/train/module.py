@@ -32,10 +32,10 @@ from gsgan.train.optimisers import (
     clip,
     parameter_groups,
 )
-from gsgan.train.registration import Registered, Registration
+from gsgan.train.registration import Registration, SurfaceOffsets
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import at_least, integer, positive
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.tensors import full_precision
 
@@ -152,9 +152,9 @@ class AvatarTraining(LightningModule):
         self.pose_noise = settings.pose_noise
         self.window = settings.window
         if self.window is not None:
-            whole("training.window", self.window, 16)
+            integer("training.window", self.window, 16)
         reach = settings.window_reach
-        self.window_reach = above("training.window_reach", reach)
+        self.window_reach = positive("training.window_reach", reach)
         self.seed = settings.seed
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
@@ -166,7 +166,7 @@ class AvatarTraining(LightningModule):
 
         # Where the surface of training frames is; known once it is registered.
         self.registration = settings.registration
-        self.registered: Registered | None = None
+        self.surface_offsets: SurfaceOffsets | None = None
 
         # Facts that checkpoints store.
         self.record = record
@@ -225,8 +225,8 @@ class AvatarTraining(LightningModule):
             )
 
     def on_train_start(self) -> None:
-        if self.registered is not None:
-            self.registered = self.registered.to(self.device)
+        if self.surface_offsets is not None:
+            self.surface_offsets = self.surface_offsets.to(self.device)
         self._began = time.monotonic()
 
     def on_train_end(self) -> None:
@@ -279,9 +279,9 @@ class AvatarTraining(LightningModule):
 
         # The frame in a window, trained by the phase that the iteration belongs to.
         frame = self._cut(frame)
-        if self.registered is not None:
+        if self.surface_offsets is not None:
             assert frame.body is not None
-            offsets = self.registered.of(frame.frame_id)
+            offsets = self.surface_offsets.of(frame.frame_id)
             frame = replace(frame, body=replace(frame.body, offsets=offsets))
 
         # A person who vanishes before the first epoch ends returns to here.
@@ -658,8 +658,8 @@ class AvatarTraining(LightningModule):
             "effects": self.avatar.effects.plain(),
             "scene": self.scene,
         }
-        if self.registered is not None:
-            checkpoint["registered"] = dict(vars(self.registered))
+        if self.surface_offsets is not None:
+            checkpoint["registered"] = dict(vars(self.surface_offsets))
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         # The avatar and the number of processes must be those of the earlier part.
@@ -673,7 +673,7 @@ class AvatarTraining(LightningModule):
 
         # Counters go on where the earlier part ended.
         if "registered" in checkpoint:
-            self.registered = Registered(**checkpoint["registered"])
+            self.surface_offsets = SurfaceOffsets(**checkpoint["registered"])
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.seconds_before = state["train_seconds"]

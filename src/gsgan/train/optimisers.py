@@ -27,9 +27,9 @@ class Recipe:
     """
 
     rate: Rate
-    betas: tuple[float, float] = (0.9, 0.99)
-    eps: float = 1e-8
-    clip: float | None = None
+    betas: tuple[float, float]
+    eps: float
+    clip: float | None
     span: Literal["both", "step_one"] = "both"
 
     def __post_init__(self) -> None:

@@ -6,10 +6,10 @@ flow. What the pose explains of it initialises `PoseOffsets`; the rest, such as 
 applied to its frame in training alone.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,32 +24,38 @@ from torch import Tensor
 from gsgan.body import blend_transforms, skin
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import spread_frames
-from gsgan.data.texture import grey, texture
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints, LearntWeights, move_normals
 from gsgan.model.interpolation import interpolation_matrix
-from gsgan.scene import BodyPose, Camera, Frame, Gaussians
+from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.skeleton.training_poses import pose_in_pelvis
 from gsgan.splat import rasterise
+from gsgan.train.surface_flow import (
+    Drawn,
+    Float,
+    Texture,
+    TrainingView,
+    average,
+    fill_unknown,
+    flow_between,
+    project_points,
+    projection_slope,
+    sample_image,
+)
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, at_least, whole
+from gsgan.utils.checks import at_least, integer, positive
 from gsgan.utils.console import progress
 from gsgan.utils.records import TensorRecord
 
-Float = NDArray[Any]
 Matrix = NDArray[np.float64]
 
 # Gaussians of the drawn texture: opacity, and standard deviation as a share of the spacing.
 PAINT_OPACITY = 0.95
 PAINT_SIGMA = 0.6
-# metres behind the drawn surface at which a point is hidden
-HIDDEN = 0.03
 # the least cosine of the angle between a point's normal and the camera
 FACING = 0.2
 # pixels by which masks shrink: outlines of the drawing are the body's, not the person's
 OUTLINE = 3
-# pixels: flow that does not lead back to where it came from is not trusted
-ROUND_TRIP = 0.7
 # pixels: longer flow counts less
 LONG = 4.0
 # neighbours of a control whose offsets are alike
@@ -63,15 +69,8 @@ RIDGES = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 FOLDS = 3
 
 
-class Texture(NamedTuple):
-    """Colours ``[N, 3]`` of a body's points and their weights ``[N]``, 0 where none is known."""
-
-    colours: Tensor
-    weights: Tensor
-
-
 @dataclass(frozen=True)
-class Registered(TensorRecord):
+class SurfaceOffsets(TensorRecord):
     """The part of the registered surface that the pose does not explain.
 
     Args:
@@ -105,20 +104,20 @@ class Registration:
     Source: ours.
     """
 
-    frames: int = 64
-    cameras: int = 6
-    smooth: float = 0.006
-    small: float = 0.0006
+    frames: int
+    cameras: int
+    smooth: float
+    small: float
 
     def __post_init__(self) -> None:
-        whole("training.registration.frames", self.frames, 2)
-        whole("training.registration.cameras", self.cameras, 1)
+        integer("training.registration.frames", self.frames, 2)
+        integer("training.registration.cameras", self.cameras, 1)
         at_least("training.registration.smooth", self.smooth, 0)
-        above("training.registration.small", self.small)
+        positive("training.registration.small", self.small)
 
     def __call__(
         self, avatar: Avatar, dataset: CaptureDataset, console: Console
-    ) -> Registered | None:
+    ) -> SurfaceOffsets | None:
         """Registers the body's surface, and starts the avatar's `PoseOffsets` with the result.
 
         None, and nothing is done, where the avatar has no such offsets or only one frame trains.
@@ -144,7 +143,7 @@ class Registration:
         with torch.no_grad():
             placed.offsets.start(rest, field)
         explained = rest + torch.einsum("fck,ckj->fcj", bends, field)
-        return Registered(torch.tensor(frames), offsets - explained)
+        return SurfaceOffsets(torch.tensor(frames), offsets - explained)
 
 
 def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -177,30 +176,11 @@ def linear_fit(bends: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     return weights[:, -1], weights[:, :-1]
 
 
-@dataclass(frozen=True)
-class TrainingView:
-    """One training image: the camera, ``image [h, w, 3]`` and ``inside [h, w]``, which fades
-    towards the outline of the mask."""
-
-    camera: Camera
-    image: Float
-    inside: Float
-
-
 class Posed(NamedTuple):
     """A frame: its images, and the body's pose."""
 
     views: list[TrainingView]
     pose: BodyPose
-
-
-class Drawn(NamedTuple):
-    """A texture as a view sees it: colours ``[h, w, 3]``, whether they are known, metres of
-    depth."""
-
-    colours: Float
-    known: Float
-    depth: Float
 
 
 class MovingSurface:
@@ -249,8 +229,8 @@ class MovingSurface:
         rows = np.arange(near[:, 1:].size)
         ones = np.ones(len(rows))
         shape = (len(rows), self.count)
-        own = np.repeat(np.arange(self.count), count - 1)
-        apart = sparse.csr_matrix((ones, (rows, own)), shape)
+        owner = np.repeat(np.arange(self.count), count - 1)
+        apart = sparse.csr_matrix((ones, (rows, owner)), shape)
         apart -= sparse.csr_matrix((ones, (rows, near[:, 1:].ravel())), shape)
 
         # The same for each axis.
@@ -281,8 +261,8 @@ class MovingSurface:
 
         # The mask, less its outline and pixels whose mask is not sure.
         inside = (item.mask[0, 0] > 0.9).float()
-        if item.unsure is not None:
-            inside = inside * (1 - item.unsure[0, 0])
+        if item.ignored is not None:
+            inside = inside * (1 - item.ignored[0, 0])
         size = 2 * OUTLINE + 1
         kernel = np.ones((size, size), np.uint8)
         shrunk = cv2.erode(inside.numpy(), kernel)
@@ -428,7 +408,7 @@ class MovingSurface:
     def _draw(
         self, view: TrainingView, means: Tensor, texture: Texture
     ) -> Drawn:
-        known = (texture.weights > 0.02).float().unsqueeze(1)
+        has_colour = (texture.weights > 0.02).float().unsqueeze(1)
         depth = view.camera.project(means.unsqueeze(0))[1][0].unsqueeze(1)
         count = len(means)
         scales = (PAINT_SIGMA * self.placed.points.spacing).unsqueeze(1)
@@ -440,7 +420,7 @@ class MovingSurface:
                 scales=scales.expand(1, count, 3),
                 opacities=torch.full((1, count), PAINT_OPACITY),
                 features=torch.cat(
-                    [texture.colours * known, known, depth], dim=1
+                    [texture.colours * has_colour, has_colour, depth], dim=1
                 ).unsqueeze(0),
             ),
             view.camera,
@@ -453,7 +433,7 @@ class MovingSurface:
         share = blended[..., 3:4]
         return Drawn(
             colours=blended[..., :3] / np.maximum(share, 1e-3),
-            known=(share[..., 0] > 0.6).astype(np.float32),
+            has_colour=(share[..., 0] > 0.6).astype(np.float32),
             depth=blended[..., 4] / np.maximum(alpha, 1e-3),
         )
 
@@ -478,102 +458,3 @@ class MovingSurface:
             colours += torch.from_numpy(colour * weight[:, None])
             weights += torch.from_numpy(weight)
         return Texture(colours / weights.clamp_min(1e-6)[:, None], weights)
-
-
-def average(textures: Iterable[Texture]) -> Texture:
-    """The average of textures, each point's colours by their weights."""
-    known = list(textures)
-    weights = torch.stack([texture.weights for texture in known])
-    colours = torch.stack([texture.colours for texture in known])
-    total = weights.sum(0)
-    mean = (colours * weights.unsqueeze(2)).sum(0)
-    return Texture(mean / total.clamp_min(1e-6)[:, None], total)
-
-
-def fill_unknown(texture: Texture, other: Texture) -> Texture:
-    """A texture, and another one where its colours are not known."""
-    known = texture.weights > 0.05
-    return Texture(
-        torch.where(known[:, None], texture.colours, other.colours),
-        torch.where(known, texture.weights, other.weights),
-    )
-
-
-def flow_between(drawn: Drawn, view: TrainingView) -> tuple[Float, Float]:
-    """Flow ``[h, w, 2]`` in pixels from a drawing to an image, and its trust ``[h, w]`` in [0, 1].
-
-    Source: OpenCV's dense inverse search (Kroeger et al., 2016).
-    """
-    # Where nothing is drawn or nobody is, both images are alike and nothing flows.
-    certain = (drawn.known * (view.inside > 0))[..., None] > 0
-    image = np.where(certain, drawn.colours, view.image)
-    a = grey(image)
-    b = grey(view.image)
-    # OpenCV's type hints lack this class.
-    create: Any = cv2.DISOpticalFlow_create  # type: ignore[attr-defined]
-    search = create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    # The way back only decides on trust, and is searched at half the resolution.
-    back = search.calc(b, a, None)
-    search.setFinestScale(0)
-    forth = search.calc(a, b, None)
-
-    # Flow is trusted where it leads back, and where there is texture in both directions.
-    height, width = a.shape
-    x, y = np.meshgrid(
-        np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
-    )
-    returned = cv2.remap(
-        back, x + forth[..., 0], y + forth[..., 1], cv2.INTER_LINEAR
-    )
-    astray = np.square(forth + returned).sum(-1)
-    trust = np.exp(-astray / ROUND_TRIP**2) * texture(b)
-    return forth, trust * view.inside * drawn.known
-
-
-def project_points(
-    view: TrainingView, means: Tensor, normals: Tensor, depth: Float
-) -> tuple[Float, Float]:
-    """Pixels ``[N, 2]`` of points, and the cosine ``[N]`` at which they face the camera; 0 for
-    points that something hides, or outside the image."""
-    pixels, far = view.camera.project(means.unsqueeze(0))
-    at = pixels[0].numpy()
-    distance = far[0].numpy()
-    towards = view.camera.centre[0] - means
-    towards = towards / towards.norm(dim=1, keepdim=True)
-    facing = (normals * towards).sum(1).numpy()
-
-    # The drawn depth is that of the nearest surface.
-    height, width = depth.shape
-    inside = ((at > 0.5) & (at < [width - 0.5, height - 0.5])).all(1)
-    shown = distance < sample_image(depth, at) + HIDDEN
-    return at, facing * (inside & shown)
-
-
-def sample_image(image: Float, pixels: Float) -> Float:
-    """``[N, ...]`` an image ``[h, w, ...]`` at pixels ``[N, 2]``, whose centres are at +0.5."""
-    # OpenCV remaps images of at most 32,767 columns, and counts from the centre of a pixel.
-    rows = np.array_split(
-        (pixels - 0.5).astype(np.float32), len(pixels) // 32_000 + 1
-    )
-    samples = [
-        cv2.remap(
-            image,
-            part[:, None, 0].copy(),
-            part[:, None, 1].copy(),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        for part in rows
-    ]
-    return np.concatenate(samples)[:, 0]
-
-
-def projection_slope(camera: Camera, means: Tensor) -> Tensor:
-    """``[N, 2, 3]`` pixels per metre: how points' pixels move with them, without lens
-    distortion."""
-    x, y, z = camera.to_camera(means.unsqueeze(0))[0].unbind(1)
-    fx, fy = camera.focal[0]
-    nothing = torch.zeros_like(z)
-    across = torch.stack([fx / z, nothing, -fx * x / z.square()], dim=1)
-    down = torch.stack([nothing, fy / z, -fy * y / z.square()], dim=1)
-    return torch.stack([across, down], dim=1) @ camera.R[0]

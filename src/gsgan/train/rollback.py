@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsgan.utils.checks import between, whole
+from gsgan.utils.checks import between, integer
 
 # mean of an image whose ground truth is within 0 and 1: beyond it Ψ has exploded
 BRIGHTEST = 10.0
@@ -27,14 +27,14 @@ class Rollback:
     All values are averaged over recent iterations, so that a fall within an epoch is
     seen. Optimisers restart after a restoration, because their momenta point into the collapse.
 
-    Settings: conf/training/long.yaml.
+    Settings: conf/training/_base.yaml.
     """
 
-    collapse: float = 0.05
-    healthy: float = 0.5
-    memory: float = 0.9
-    max_restorations: int = 3
-    slower: float = 0.5
+    collapse: float
+    healthy: float
+    memory: float
+    max_restorations: int
+    slower: float
     done: int = 0
     means: dict[str, Tensor] = field(default_factory=dict)
     _state: dict[str, Any] | None = field(default=None, repr=False)
@@ -44,7 +44,7 @@ class Rollback:
         between("training.rollback.collapse", self.collapse, 0, self.healthy)
         between("training.rollback.memory", self.memory, 0, 1)
         between("training.rollback.slower", self.slower, 0, 1)
-        whole("training.rollback.max_restorations", self.max_restorations, 0)
+        integer("training.rollback.max_restorations", self.max_restorations, 0)
 
     @property
     def rate(self) -> float:

@@ -27,7 +27,7 @@ from rich.console import Console
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.origin import read_method, training_code
 from gsgan.evaluate.run import ScoreOptions, choice_marks, evaluate_method
-from gsgan.evaluate.scores import painter
+from gsgan.evaluate.scores import make_predictor
 from gsgan.export.page import refuse_unsuitable
 from gsgan.export.run import ExportOptions, export
 from gsgan.fit.fitter import Fit
@@ -52,7 +52,7 @@ from gsgan.train.resume import (
 )
 from gsgan.train.trainer import TrainerFactory, build_trainer, quiet_lightning
 from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.config import CommandOptions, build, with_defaults
 from gsgan.utils.console import make_console, working
 from gsgan.utils.errors import ConfigError
@@ -119,7 +119,7 @@ class TrainOptions(CommandOptions):
     def from_config(cls, config: DictConfig) -> Self:
         """The options of a config."""
         # Losses of the user's own may draw weights.
-        whole("seed", config.seed, 0)
+        integer("seed", config.seed, 0)
         torch.manual_seed(config.seed + DISCRIMINATOR_SALT)
 
         # A device that the user chose is accepted.
@@ -252,7 +252,7 @@ def _prepare_avatar(
     if distil is not None:
         start_from(module.avatar, data, Path(distil).expanduser())
     elif module.avatar.effects.registration.on:
-        module.registered = module.registration(
+        module.surface_offsets = module.registration(
             module.avatar, data.dataset("train"), console
         )
 
@@ -348,10 +348,12 @@ def start_from(avatar: Avatar, data: GsganData, run: Path) -> None:
 
     # Other points at rest would need other residuals, so both avatars must have the same.
     state = {"rest_points": fitted.rest_points, **fitted.state_dict()}
-    own = avatar.state_dict()
-    own["rest_points"] = avatar.rest_points
+    current = avatar.state_dict()
+    current["rest_points"] = avatar.rest_points
     alike = all(
-        x.shape == own[name].shape for name, x in state.items() if name in own
+        x.shape == current[name].shape
+        for name, x in state.items()
+        if name in current
     )
     if not (
         alike
@@ -447,7 +449,7 @@ def _evaluate(
         options.score,
         console,
         data,
-        predict=painter(avatar),
+        predict=make_predictor(avatar),
         method=method,
         device=device,
         marks=marks,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from gsgan.utils.checks import above, at_least, between, one_of
+from gsgan.utils.checks import at_least, between, one_of, positive
 from gsgan.utils.errors import ConfigError
 
 SEGMENTATION = "segmentation"
@@ -24,7 +24,7 @@ SPLATTING = ("psi", "colour")
 
 @dataclass(frozen=True)
 class Schedule:
-    """Iterations of each phase: segmentation, Step I, Step II (conf/training/long.yaml).
+    """Iterations of each phase: segmentation, Step I, Step II (conf/training/_base.yaml).
 
     Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
     """
@@ -34,16 +34,16 @@ class Schedule:
     step_one: int
     step_two: int
 
-    # Iterations within the steps, see conf/training/long.yaml.
-    discriminator_start: int = 0
-    epoch: int = 250
-    stretch: float = 1.0
-    degree_every: int = 0
-    coarse: int = 0
+    # Iterations within the steps, see conf/training/_base.yaml.
+    discriminator_start: int
+    epoch: int
+    stretch: float
+    degree_every: int
+    coarse: int
 
     def __post_init__(self) -> None:
         # No length may be negative, and the run needs at least one iteration.
-        above("training.schedule.stretch", self.stretch)
+        positive("training.schedule.stretch", self.stretch)
         for name in ("segmentation", *STRETCHED_STEPS):
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
         at_least("training.schedule.epoch", self.epoch, 1)
@@ -179,10 +179,10 @@ class Rate:
     """
 
     peak: float
-    hold: float = 0.5
-    final: float = 0.0
-    warmup: int = 0
-    shape: str = "cosine"
+    hold: float
+    final: float
+    warmup: int
+    shape: str
 
     def __post_init__(self) -> None:
         one_of("rate.shape", self.shape, _SHAPES)

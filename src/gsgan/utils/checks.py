@@ -8,6 +8,8 @@ from typing import Any
 
 from gsgan.utils.errors import ConfigError
 
+AUTO = "auto"  # the value of an option that the data decides
+
 
 def _require(holds: bool, name: str, expected: str, value: Any) -> None:
     if not holds:
@@ -34,18 +36,14 @@ def at_least(name: str, value: Any, minimum: float) -> Any:
     return value
 
 
-def above(name: str, value: Any, bound: float = 0) -> Any:
-    """A number above ``bound``."""
-    _require(
-        is_number(value) and value > bound,
-        name,
-        f"a number above {bound}",
-        value,
-    )
+def positive(name: str, value: Any) -> Any:
+    """A number above 0."""
+    good = is_number(value) and value > 0
+    _require(good, name, "a number above 0", value)
     return value
 
 
-def whole(name: str, value: Any, minimum: int) -> int:
+def integer(name: str, value: Any, minimum: int) -> int:
     """A whole number of at least ``minimum``."""
     # True and False are integers of Python.
     good = (
@@ -61,8 +59,8 @@ def one_of(name: str, value: Any, choices: Iterable[Any]) -> Any:
     """One of the choices."""
     # Types are compared too: True equals 1, and is not meant by it.
     choices = tuple(choices)
-    known = any(
+    is_choice = any(
         type(value) is type(choice) and value == choice for choice in choices
     )
-    _require(known, name, f"one of {', '.join(map(str, choices))}", value)
+    _require(is_choice, name, f"one of {', '.join(map(str, choices))}", value)
     return value

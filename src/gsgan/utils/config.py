@@ -135,7 +135,8 @@ Plugins.instance().register(PackageConfigs)
 
 
 def defaults_of(command: str) -> DictConfig:
-    """The options of a command with their defaults, without Hydra's own entries."""
+    """The options of a command, or of a choice such as ``effects/auto``, with their defaults,
+    without Hydra's own entries."""
     options = OmegaConf.load(config_folder() / f"{command}.yaml")
     assert isinstance(options, DictConfig)
     for key in ("defaults", "hydra"):

@@ -85,12 +85,12 @@ def check_image(
     Raises:
         DataError: on a wrong size, bit depth, or channel layout.
     """
-    found, depth, mode = read_header(path)
+    actual, depth, mode = read_header(path)
 
     # Size, then depth, then channels.
-    if found != size:
+    if actual != size:
         raise DataError(
-            f"{path} is {found[1]}x{found[0]} pixels (width x height), but "
+            f"{path} is {actual[1]}x{actual[0]} pixels (width x height), but "
             f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
     refuse_deep(path, depth)

@@ -227,10 +227,10 @@ class _Unpickler(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         # The names of one version stand for those of all.
-        known = RENAMED.get(module, module), name
-        if known not in ALLOWED:
+        source = RENAMED.get(module, module), name
+        if source not in ALLOWED:
             raise _Refused(f"{module}.{name}")
-        return ALLOWED[known]
+        return ALLOWED[source]
 
 
 def _load(stream: BinaryIO) -> Any:

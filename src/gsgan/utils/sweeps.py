@@ -56,14 +56,14 @@ def run_job(command: str, objective: str | None) -> float | None:
         override for override in given if not OF_THE_SWEEP.match(override)
     ]
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    own = ["hydra.mode=RUN", f"hydra.run.dir='{quoted}'"]
+    run_overrides = ["hydra.mode=RUN", f"hydra.run.dir='{quoted}'"]
     for source in settings.runtime.config_sources:
         if (
             source.provider == "command-line"
         ):  # --config-dir, of which Hydra takes one
-            own += ["--config-dir", source.path]
+            run_overrides += ["--config-dir", source.path]
     status = _status(
-        [sys.executable, "-m", f"gsgan.{command}", *arguments, *own]
+        [sys.executable, "-m", f"gsgan.{command}", *arguments, *run_overrides]
     )
 
     # The mark goes when the job has ended well and has the score that is asked for.

@@ -23,7 +23,7 @@ from gsgan.run.drive import (
 )
 from gsgan.run.runs import RunReference
 from gsgan.skeleton.proportions import upright
-from gsgan.utils.checks import above, between, whole
+from gsgan.utils.checks import between, integer, positive
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
@@ -40,7 +40,7 @@ ELSEWHERE = (
     "192.0.2.1",
     9,
 )  # an address for documentation, and the port that discards
-ORIGIN = r"https?://[^/\s]+/?"
+ORIGIN_PATTERN = r"https?://[^/\s]+/?"
 MAX_UPLOADS = 8  # of a browser at the same time
 
 
@@ -94,7 +94,7 @@ class Viewer:
         # The avatar.
         viser = import_viser()
         self.run = options.source.load()
-        fps = float(above("fps", options.fps))
+        fps = float(positive("fps", options.fps))
         if options.distilled:
             self.run.avatar = distil_run(options.driven, self.run)
 
@@ -106,7 +106,7 @@ class Viewer:
         # The settings and the first motion of all browsers.
         first = REST if self.run.is_shared else self.run.data.watched[0]
         drive = read(options.driven.motion or first)
-        size = whole(
+        size = integer(
             "pixels",
             options.pixels or self.run.trained_as.image_size or 512,
             16,
@@ -120,19 +120,19 @@ class Viewer:
             behind=behind,
             size=size,
             fps=fps,
-            rate=float(above("rate", options.rate)),
+            rate=float(positive("rate", options.rate)),
         )
 
         # The page's address behind a proxy.
         origin = None if options.origin is None else str(options.origin)
-        if origin is not None and not re.fullmatch(ORIGIN, origin):
+        if origin is not None and not re.fullmatch(ORIGIN_PATTERN, origin):
             raise ConfigError(
                 f"origin must be the beginning of an address, such as https://name, got {origin!r}"
             )
 
         # With an address of another machine, viser would never return.
         host = str(options.host)
-        port = between("port", whole("port", options.port, 0), 0, 65535)
+        port = between("port", integer("port", options.port, 0), 0, 65535)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             socket.create_server((host, 0), family=family).close()
@@ -158,7 +158,7 @@ class Viewer:
         self._camera(size)
 
         # A session per browser, and one thread that renders for all.
-        self._limit = int(above("max_upload", options.max_upload) * MEGABYTE)
+        self._limit = int(positive("max_upload", options.max_upload) * MEGABYTE)
         self.sessions: dict[int, Session] = {}
         self._wake = threading.Event()
         self._ended = False
@@ -185,8 +185,8 @@ class Viewer:
         port = self.server.get_port()
         if self.server.get_host() not in EVERYWHERE:
             return [self.address]
-        own = [f"http://{name}:{port}" for name in network_addresses()]
-        return [*own, f"http://localhost:{port}"]
+        network = [f"http://{name}:{port}" for name in network_addresses()]
+        return [*network, f"http://localhost:{port}"]
 
     def serve(self) -> None:
         """Waits until interrupted."""

@@ -78,15 +78,17 @@ def load_pretrained(net: str, path: str | Path | None = None) -> FeatureNetwork:
             network.
     """
     # Weights are assigned to layers without values, so nothing is drawn at random.
-    found = get(net, path)
+    weights = get(net, path)
     network = NETWORKS[net]
     layers = empty_layers(network)
     try:
-        layers.load_state_dict(read_convolutions(net, found.path), assign=True)
+        layers.load_state_dict(
+            read_convolutions(net, weights.path), assign=True
+        )
     # AttributeError: a value is no tensor
     except (RuntimeError, AttributeError) as error:
         raise DataError(
-            f"{found.path}: these are not torchvision's weights of {network.title}"
+            f"{weights.path}: these are not torchvision's weights of {network.title}"
         ) from error
 
     # Layers must not overwrite the maps before them, which are kept.

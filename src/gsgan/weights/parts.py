@@ -151,7 +151,7 @@ def _span(marked: Tensor) -> Span:
     return places[0], places[-1] + 1
 
 
-class Window(NamedTuple):
+class LayerWindow(NamedTuple):
     """What a layer reads, equal for rows and columns."""
 
     kernel: int
@@ -159,12 +159,12 @@ class Window(NamedTuple):
     padding: int
 
 
-def _window(layer: nn.Module) -> Window:
+def _window(layer: nn.Module) -> LayerWindow:
     """The window of a convolution or a pooling."""
     assert isinstance(layer, nn.Conv2d | nn.MaxPool2d)
     settings = (layer.kernel_size, layer.stride, layer.padding)
     sides = [x[0] if isinstance(x, tuple) else x for x in settings]
-    return Window(*map(int, sides))
+    return LayerWindow(*map(int, sides))
 
 
 def _reach(layer: nn.Module, span: Span, length: int) -> tuple[Span, Span]:

@@ -36,7 +36,13 @@ from gsgan.data.calibration import (
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
+from gsgan.data.layout import (
+    BodyModel,
+    DatasetFiles,
+    Layout,
+    Meta,
+    dataset_folder,
+)
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import (
     SKELETONS,
@@ -52,7 +58,7 @@ from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.joints import zeros_as_missing
 from gsgan.skeleton.proportions import UP_AXES
 from gsgan.utils.arrays import expect_array
-from gsgan.utils.checks import is_number, whole
+from gsgan.utils.checks import integer, is_number
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import read_json
 from gsgan.utils.frame_files import FrameFiles, entries, frame_files
@@ -85,7 +91,7 @@ class CaptureReader:
     ignore_band: int = 0
 
     def __post_init__(self) -> None:
-        whole("data.reader.ignore_band", self.ignore_band, 0)
+        integer("data.reader.ignore_band", self.ignore_band, 0)
 
     def __call__(
         self, root: str | Path, limits: Thresholds, smpl: str | None = None
@@ -125,7 +131,7 @@ def _find(
     limits: Thresholds,
     smpl: str | None,
     reader: CaptureReader,
-) -> Found:
+) -> DatasetFiles:
     """The files of a capture, each checked separately."""
     notes: list[str] = []
 
@@ -172,7 +178,7 @@ def _find(
     if (root / POSES_FILE).exists():
         poses, meta = _read_poses(root, meta, conventions)
 
-    return Found(
+    return DatasetFiles(
         root=root,
         meta=meta,
         cameras=cameras,
@@ -185,7 +191,7 @@ def _find(
         face=face,
         poses=poses,
         pixels=PixelRules(
-            composed=conventions.composed, unsure_band=reader.ignore_band
+            composed=conventions.composed, ignored_band=reader.ignore_band
         ),
         calibration=root / "cameras.json",
         unit_hint=(
@@ -235,8 +241,10 @@ def capture_problems(
         )
         if cameras is not None:
             images = attempt(lambda: _index_images(root, cameras)) or {}
-            known = [*already, *problems]
-            problems += islice(_file_problems(root, images, known), MAX_FILES)
+            reported = [*already, *problems]
+            problems += islice(
+                _file_problems(root, images, reported), MAX_FILES
+            )
 
     # Landmarks and body poses.
     joints = SKELETONS["mediapipe33" if meta is None else meta.skeleton]
@@ -264,14 +272,14 @@ def _masks_of(root: Path, camera: str) -> FrameFiles:
 
 
 def _file_problems(
-    root: Path, images: Mapping[str, FrameFiles], known: Sequence[str]
+    root: Path, images: Mapping[str, FrameFiles], reported: Sequence[str]
 ) -> Iterator[str]:
     """A sentence for each image without a mask, and each image or mask that cannot be read.
 
-    Files that the sentences ``known`` name already are left out.
+    Files that the sentences ``reported`` name already are left out.
     """
     everywhere = sorted({frame for files in images.values() for frame in files})
-    named = " ".join(known)
+    named = " ".join(reported)
     for camera, files in images.items():
         try:
             masks = _masks_of(root, camera)
@@ -430,11 +438,11 @@ def _read_landmarks(
 def _refuse_another_order(path: Path, names: Any) -> None:
     """Refuses the names of the 33 landmarks in another order; other names are nobody's order."""
     given = () if names is None else tuple(map(str, names.tolist()))
-    own = MEDIAPIPE33.names
-    if given != own and sorted(given) == sorted(own):
+    mediapipe = MEDIAPIPE33.names
+    if given != mediapipe and sorted(given) == sorted(mediapipe):
         raise DataError(
-            f"{path}: 'names' has the landmarks in another order than MediaPipe's, from {own[0]} "
-            f"to {own[-1]}; write the columns of p and conf in that order"
+            f"{path}: 'names' has the landmarks in another order than MediaPipe's, from "
+            f"{mediapipe[0]} to {mediapipe[-1]}; write the columns of p and conf in that order"
         )
 
 
@@ -472,8 +480,10 @@ def _read_poses(
     )
     registered: frozenset[int] = frozenset()
     if "registered" in arrays:
-        found = expect_array(arrays, "registered", (None,), path)
-        registered = frozenset(whole_frame_ids(found, str(path)).tolist())
+        registered_ids = expect_array(arrays, "registered", (None,), path)
+        registered = frozenset(
+            whole_frame_ids(registered_ids, str(path)).tolist()
+        )
     fitted_to = tuple(map(str, arrays.get("fitted_to", ())))
 
     # The poses, and those that follow the hands too.
@@ -513,17 +523,17 @@ def _read_poses(
         )
 
     # The second version, if there is one, follows the hands.
-    own = poses[0]
+    body_poses = poses[0]
     if len(poses) > 1:
-        own = replace(own, with_hands=poses[1])
+        body_poses = replace(body_poses, with_hands=poses[1])
 
     # The shape of an SMPL body.
     if meta.body is None or "betas" not in arrays:
-        return own, meta
+        return body_poses, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
     if not np.isfinite(betas).all():
         raise DataError(f"{path}: 'betas' must hold finite numbers")
-    return own, replace(
+    return body_poses, replace(
         meta, body=replace(meta.body, betas=tuple(betas.tolist()))
     )
 

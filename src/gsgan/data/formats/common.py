@@ -10,7 +10,13 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import Consistency, check_consistency
-from gsgan.data.layout import Found, Layout, MaskIndex, assemble, dataset_folder
+from gsgan.data.layout import (
+    DatasetFiles,
+    Layout,
+    MaskIndex,
+    assemble,
+    dataset_folder,
+)
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
 from gsgan.data.validation import Thresholds
@@ -73,7 +79,9 @@ class FolderReader:
             layout, limits, self.consistency, self.hint, self.drop_frames
         )
 
-    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
+    def find(
+        self, root: Path, limits: Thresholds, smpl: str | None
+    ) -> DatasetFiles:
         """The dataset's files, each checked separately.
 
         Raises:
@@ -83,7 +91,7 @@ class FolderReader:
 
 
 def finish(
-    found: Found,
+    files_found: DatasetFiles,
     limits: Thresholds,
     consistency: Consistency,
     hint: str,
@@ -92,7 +100,7 @@ def finish(
     """Checks the files against each other and a few masks against the joints.
 
     Args:
-        found: by a reader.
+        files_found: by a reader.
         limits: thresholds.
         consistency: number of compared images, and thresholds.
         hint: what to check when joints and masks do not agree.
@@ -106,16 +114,17 @@ def finish(
     if drop_frames is not None:
         gone = parse_frames(drop_frames, "data.reader.drop_frames")
         images = {
-            name: files.without(gone) for name, files in found.images.items()
+            name: files.without(gone)
+            for name, files in files_found.images.items()
         }
         if not any(images.values()):
             raise ConfigError(
                 f"data.reader.drop_frames={drop_frames} leaves no frame"
             )
-        found = replace(found, images=images)
+        files_found = replace(files_found, images=images)
 
     # Files against each other, then a few masks against the joints.
-    layout = assemble(found, limits)
+    layout = assemble(files_found, limits)
     check_consistency(layout, consistency, hint)
     return layout
 

@@ -98,7 +98,7 @@ def check_consistency(
         )
 
     # The mean share of each camera; the message shows all, since one may be wrong.
-    inside = {name: np.mean(found) for name, found in shares.items()}
+    inside = {name: np.mean(share) for name, share in shares.items()}
     if inside and min(inside.values()) < limits.refused_below:
         text = ", ".join(
             f"{name} {share:.0%}" for name, share in inside.items()
@@ -204,11 +204,11 @@ def inside_share(
     outside = joint_distance(distance, shown / step, depth, everyone, focal)
 
     # The tolerance in metres, but at least some pixels of the small mask.
-    known = ~np.isnan(outside)
-    if not known.any():
+    has_distance = ~np.isnan(outside)
+    if not has_distance.any():
         return np.nan
     allowed = np.maximum(tolerance, TOLERANCE * depth / focal)
-    return float((outside <= allowed)[known].mean())
+    return float((outside <= allowed)[has_distance].mean())
 
 
 def spread(values: Sequence[Value], count: int) -> list[Value]:

@@ -26,7 +26,7 @@ from gsgan.data.formats.common import (
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
-from gsgan.data.layout import BodyModel, Found, Meta
+from gsgan.data.layout import BodyModel, DatasetFiles, Meta
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of, spans
@@ -75,7 +75,9 @@ class EasymocapReader(FolderReader):
         "(data.reader.person)"
     )
 
-    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
+    def find(
+        self, root: Path, limits: Thresholds, smpl: str | None
+    ) -> DatasetFiles:
         """See `FolderReader.find`."""
         # Images of the cameras that have a folder, and their calibrations.
         notes: list[str] = []
@@ -110,7 +112,7 @@ class EasymocapReader(FolderReader):
             ids, p, conf = _read_keypoints(people)
 
         # Everything in the reader's terms; the layout has no part labels.
-        return Found(
+        return DatasetFiles(
             root=root,
             meta=Meta(
                 fps=self.fps,
@@ -143,25 +145,25 @@ class EasymocapReader(FolderReader):
         path = root / "intri.yml"
         calibration = read_calibration(path, pixel_centre=self.pixel_centre)
         notes += calibration.notes
-        known = calibration.cameras
+        calibrated = calibration.cameras
 
         # The size of the images is not in the calibration.
         cameras = {}
         for name, files in images.items():
-            if name not in known:
+            if name not in calibrated:
                 raise DataError(
                     f"{root / 'images' / name} is not a camera of {path}, which lists "
-                    f"{', '.join(known)}; cameras are paired by name: rename the folder or "
+                    f"{', '.join(calibrated)}; cameras are paired by name: rename the folder or "
                     "calibrate it"
                 )
             # A calibration without sizes takes those of the images.
-            camera = known[name]
+            camera = calibrated[name]
             if min(camera.size) == 0:
                 camera = replace(camera, size=image_size(root, files))
             cameras[name] = camera
 
         # Cameras of the calibration that did not record this take.
-        idle = [name for name in known if name not in images]
+        idle = [name for name in calibrated if name not in images]
         if idle:
             notes.append(
                 f"{path} lists cameras without images, left out: {', '.join(idle)}"
@@ -201,13 +203,13 @@ def _masks(
         files = frame_files(
             root, f"mask/{name}", (".png", ".jpg"), _frame_and_person
         )
-        own: dict[int, tuple[MaskFile, ...]] = {}
+        by_frame: dict[int, tuple[MaskFile, ...]] = {}
         # A mask without an id comes first, so that the person's own replaces it.
         for key, path in sorted(files.items()):
             frame, number = divmod(key, PEOPLE)
             if number in (0, person + 1):
-                own[frame] = (mask_file(path),)
-        masks[name] = own
+                by_frame[frame] = (mask_file(path),)
+        masks[name] = by_frame
     return masks
 
 
@@ -255,7 +257,7 @@ def _read_people(
     """The person's entry, with the file's name for messages, by frame that has images."""
     # One file per frame, each with all people.
     files = frame_files(root, folder, (".json",))
-    found = {}
+    entries = {}
     lacking = []
     seen = set[int]()
     there = sorted(set(frames) & set(files))
@@ -265,7 +267,7 @@ def _read_people(
         people = _people(root / files[frame])
         seen |= set(people)
         if person in people:
-            found[frame] = (
+            entries[frame] = (
                 f"{root / files[frame]}, person {person}",
                 people[person],
             )
@@ -273,7 +275,7 @@ def _read_people(
             lacking.append(frame)
 
     # The most likely cause is another number of the person.
-    if not found:
+    if not entries:
         ids = ", ".join(map(str, sorted(seen))) or "nobody"
         raise DataError(
             f"{root / folder} has no person {person} in the {len(there)} of its {len(files)} files "
@@ -283,7 +285,7 @@ def _read_people(
         notes.append(
             f"{folder} lacks person {person} at frames {spans(lacking)}"
         )
-    return found
+    return entries
 
 
 def _people(path: Path) -> dict[int, Mapping[str, Any]]:

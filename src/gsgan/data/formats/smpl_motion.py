@@ -78,7 +78,7 @@ def landmarks_of(
             expression = torch.from_numpy(motion.expression[part])
 
         # Only the vertices that are landmarks are posed.
-        found, joints = small.pose(
+        vertex_places, joints = small.pose(
             torch.from_numpy(motion.theta[part]),
             torch.from_numpy(motion.betas[part]),
             torch.from_numpy(motion.transl[part]),
@@ -87,7 +87,7 @@ def landmarks_of(
         )
 
         # The landmarks of each frame, from vertices at their places in the whole body.
-        for v, j in zip(found.numpy(), joints.numpy(), strict=True):
+        for v, j in zip(vertex_places.numpy(), joints.numpy(), strict=True):
             full = np.full((len(model.v_template), 3), np.nan)
             full[vertices] = v[: len(vertices)]
             one_p, one_conf = to_mediapipe33(j, full, kind)

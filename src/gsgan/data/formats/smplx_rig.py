@@ -23,12 +23,12 @@ from gsgan.data.formats.common import (
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of
-from gsgan.data.layout import BodyModel, Found, Meta
+from gsgan.data.layout import BodyModel, DatasetFiles, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of, spans
 from gsgan.utils.arrays import Float, as_floats
-from gsgan.utils.checks import whole
+from gsgan.utils.checks import integer
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import read_json, read_text
 from gsgan.utils.frame_files import FrameFiles, frame_files, last_number
@@ -78,7 +78,7 @@ class SmplxRigReader(FolderReader):
 
     def __post_init__(self) -> None:
         # Options of a config are checked before any file is read.
-        whole("data.reader.ignore_band", self.ignore_band, 0)
+        integer("data.reader.ignore_band", self.ignore_band, 0)
         alpha = self.ignore_alpha
         if alpha is None:
             return
@@ -88,7 +88,9 @@ class SmplxRigReader(FolderReader):
                 f"[5, 250], got {list(alpha)}"
             )
 
-    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
+    def find(
+        self, root: Path, limits: Thresholds, smpl: str | None
+    ) -> DatasetFiles:
         """See `FolderReader.find`."""
         notes = list[str]()
 
@@ -114,7 +116,7 @@ class SmplxRigReader(FolderReader):
 
         # A pair: a config gives a list.
         alpha = self.ignore_alpha
-        return Found(
+        return DatasetFiles(
             root=root,
             meta=Meta(
                 fps=self.fps,
@@ -135,8 +137,8 @@ class SmplxRigReader(FolderReader):
             poses=motion.poses(PARAMETERS),
             pixels=PixelRules(
                 threshold=self.threshold,
-                unsure_band=self.ignore_band,
-                unsure_alpha=None if alpha is None else (alpha[0], alpha[1]),
+                ignored_band=self.ignore_band,
+                ignored_alpha=None if alpha is None else (alpha[0], alpha[1]),
             ),
             calibration=path,
             unit_hint=f"T in {path} and transl in {root / PARAMETERS} must be in metres",

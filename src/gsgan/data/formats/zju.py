@@ -30,7 +30,7 @@ from gsgan.data.formats.common import (
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, zju_motion
-from gsgan.data.layout import BodyModel, Found, Meta
+from gsgan.data.layout import BodyModel, DatasetFiles, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.data.validation import Thresholds, frames_of
@@ -75,7 +75,9 @@ class ZjuReader(FolderReader):
         "ones do not fit CoreView images)"
     )
 
-    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
+    def find(
+        self, root: Path, limits: Thresholds, smpl: str | None
+    ) -> DatasetFiles:
         """See `FolderReader.find`."""
         # Cameras, and the images in their folders.
         annots = read_annots(root)
@@ -103,7 +105,7 @@ class ZjuReader(FolderReader):
 
         # Part labels count as masks too.
         masks, labels = _index_masks(root, folders)
-        return Found(
+        return DatasetFiles(
             root=root,
             meta=Meta(
                 unit="mm",
@@ -316,9 +318,9 @@ def _index_masks(
 
     # The other masks of the same images are joined with them.
     for name, folder in folders.items():
-        own = masks[name]
+        by_frame = masks[name]
         for frame, path in _mask_files(root, "mask", name, folder).items():
-            own[frame] = (*own.get(frame, ()), mask_file(path))
+            by_frame[frame] = (*by_frame.get(frame, ()), mask_file(path))
     return masks, labels if any(labels.values()) else {}
 
 

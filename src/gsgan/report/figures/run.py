@@ -37,7 +37,7 @@ from gsgan.report.figures.subjects import (
 )
 from gsgan.run.runs import RunReference
 from gsgan.run.stored import load_config
-from gsgan.utils.checks import at_least, one_of, whole
+from gsgan.utils.checks import at_least, integer, one_of
 from gsgan.utils.config import CommandOptions
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
@@ -162,8 +162,8 @@ def _measure(
     return images, numbers
 
 
-def _decibels(found: Numbers) -> str:
-    return format_number(found["psnr"], 2, " dB")
+def _decibels(numbers: Numbers) -> str:
+    return format_number(numbers["psnr"], 2, " dB")
 
 
 NUMBERS_FILE = "figures.json"
@@ -293,13 +293,13 @@ def _draw(
     # Options are checked here, since each figure has its own number of shots.
     frames = list(dict.fromkeys(_list(options.frames)))
     for frame in frames:
-        whole("frames", frame, 0)
+        integer("frames", frame, 0)
     items = choose_items(
         data,
         split,
         frames=frames or None,
         camera=None if options.camera is None else str(options.camera),
-        count=whole(f"shots.{name}", options.shots.get(name), 1),
+        count=integer(f"shots.{name}", options.shots.get(name), 1),
         one_camera=name == "strip",
     )
 

@@ -96,19 +96,19 @@ def choose_items(
     for item in items:
         if camera in (None, item[0]):
             seen_by.setdefault(item[1], []).append(item)
-    known = sorted(seen_by)
+    shared = sorted(seen_by)
 
     # The frames: chosen ones that all exist, or some that are spread evenly.
     if frames is None:
-        frames = [known[i] for i in evenly_spaced(len(known), count)]
-    if lacking := [frame for frame in frames if frame not in known]:
+        frames = [shared[i] for i in evenly_spaced(len(shared), count)]
+    if lacking := [frame for frame in frames if frame not in shared]:
         of = (
             f"split {split}"
             if camera is None
             else f"camera {camera} in split {split}"
         )
         raise ConfigError(
-            f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}"
+            f"frames: {of} lacks {spans(lacking)}; it has {spans(shared)}"
         )
 
     # The i-th of n frames is shown by the camera at (i + 1/2) / n of its cameras.
