@@ -13,19 +13,31 @@ from typing import Any
 
 import bench_common
 import pandas as pd
+import torch
+from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from gsgan.bench.common import markdown, sentence
+from gsgan.bench.common import check_whole, markdown, sentence
+from gsgan.bench.speed import (
+    TOTAL,
+    SpeedOptions,
+    load_subject,
+    make_painter,
+    measure,
+    without_denormals,
+)
+from gsgan.utils.config import config_folder, quote
 
 SPLIT = "novel_pose"
 METRICS = {
     "psnr_person": "in box, dB",
     "lpips_vgg": "LPIPS-VGG",
     "lpips_alex": "LPIPS-Alex",
-    "high_frequencies": "energy",
+    "ms": "ms",
 }
-DIGITS = {"psnr_person": 2, "high_frequencies": 3}
+DIGITS = {"psnr_person": 2, "ms": 1}
 ALG_1 = "alg1"
+FINAL = "final"
 
 
 def run(config: DictConfig, folder: Path) -> None:
@@ -39,24 +51,30 @@ def run(config: DictConfig, folder: Path) -> None:
         GsganError: when a training fails.
     """
     bench = bench_common.Bench.start("generator", config, folder)
+    check_whole(config, frames=1)
     rows = []
     for points in config.points:
         ratio = config.ratios.get(points, 1)
         for model in ("full", "splat_only", *config.further.get(points, [])):
             for seed in config.seeds.get(points, [0]):
                 rows += train(config, folder, points, ratio, model, seed)
+
+    # Times follow each other, after all trainings.
+    for row in rows:
+        if row["seed"] == 0 and row["image"] == FINAL:
+            run = folder / run_name(row["model"], row["points"], 0)
+            row["ms"] = milliseconds(run, config.frames, bench.device)
     scores = pd.DataFrame(rows)
 
-    # One row of the table for each model and image, with the mean and the deviation over seeds.
-    groups = scores.groupby(["points", "model", "image"], sort=False)
+    # One row of the table for each model, with the mean and the deviation over seeds.
+    final = scores[scores["image"] == FINAL]
+    groups = final.groupby(["points", "model"], sort=False)
     cells = groups[list(METRICS)].agg(["mean", "std"])
-    table = pd.DataFrame(
-        {
-            heading: [in_words(metric, *pair) for pair in cells[metric].values]
-            for metric, heading in METRICS.items()
-        },
-        index=cells.index,
-    ).reset_index()
+    columns = {
+        heading: [in_words(metric, *pair) for pair in cells[metric].values]
+        for metric, heading in METRICS.items()
+    }
+    table = pd.DataFrame(columns, index=cells.index).reset_index()
     bench.write(
         "Who needs the generator",
         f"{markdown(table)}\n\n{sentence(bench.where)}",
@@ -64,6 +82,28 @@ def run(config: DictConfig, folder: Path) -> None:
         scores,
         {"generator.png": draw(scores)},
     )
+
+
+def run_name(model: str, points: int | str, seed: int) -> str:
+    """The folder of a run."""
+    return f"{model}_{points}_{seed}"
+
+
+def milliseconds(run: Path, frames: int, device: torch.device) -> float:
+    """The median time of an image from a bare skeleton."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        speed = compose("bench_speed", [quote(f"run={run.resolve()}")])
+    options = SpeedOptions.from_config(speed)
+    avatar, poses, _, _ = load_subject(options, device)
+    with without_denormals():
+        times = measure(
+            avatar,
+            make_painter(avatar),
+            poses,
+            count=frames,
+            warmup=options.warmup,
+        )
+    return float(times.at[TOTAL, "median"])
 
 
 def train(
@@ -75,7 +115,7 @@ def train(
     seed: int,
 ) -> list[dict[str, Any]]:
     """The scores of a run's images: the final one and, below a generator, Step I's colour."""
-    run = folder / f"{model}_{points}_{seed}"
+    run = folder / run_name(model, points, seed)
     chosen = f"model.body_points.points={points}"
     if points == ALG_1:
         chosen = "effects.body_points=off"
@@ -84,10 +124,14 @@ def train(
         overrides.append(f"equal_time.splat_only={ratio}")
     bench_common.train(overrides, run)
     variants = json.loads((run / "metrics.json").read_text())[SPLIT]
-    images = {"full": "final", "splat": "Step I's colour"}
+    images = {"full": FINAL, "splat": "Step I's colour"}
     return [
         {"points": points, "model": model, "seed": seed, "image": image}
-        | {metric: variants[variant][metric] for metric in METRICS}
+        | {
+            metric: variants[variant][metric]
+            for metric in METRICS
+            if metric != "ms"
+        }
         for variant, image in images.items()
         if variant in variants
     ]

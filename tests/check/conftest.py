@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from configs import check_limits, check_sampling
+from configs import check_limits, check_sampling, effect_settings
 
 from gsgan.check.report import CheckReport
 
@@ -65,7 +65,10 @@ def check(monkeypatch):
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised
         return check_data(
-            data, sampling, check_limits(limb_share=2.0, **limits)
+            data,
+            sampling,
+            check_limits(limb_share=2.0, **limits),
+            effect_settings(),
         )
 
     return run
