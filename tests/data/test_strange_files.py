@@ -9,6 +9,7 @@ import pytest
 from make import write_tiny_capture
 
 from gsgan.data.calibration import read_calibration
+from gsgan.data.cameras import numbers
 from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.pixels import PixelRules, read_mask
 from gsgan.data.validation import Thresholds
@@ -17,6 +18,7 @@ from gsgan.prepare.options import Inputs
 from gsgan.prepare.run import with_detections
 from gsgan.prepare.sources import Recording
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import read_json
 from gsgan.utils.frame_files import counting
 from gsgan.utils.image_files import read_colour
 
@@ -62,12 +64,35 @@ def test_masks_of_another_value_than_white_are_named(tmp_path, value):
 
 
 @pytest.mark.parametrize("colour", [(0, 255, 0), (0, 165, 255), (255, 0, 0)])
-def test_masks_of_one_colour_are_named(tmp_path, colour):
+def test_masks_of_one_colour_are_read(tmp_path, colour):
     """Their grey value would make the person transparent."""
     filled = (SOFT > 99)[..., None] * np.array(colour, np.uint8)
     cv2.imwrite(str(tmp_path / "m.png"), filled)
+    np.testing.assert_array_equal(
+        mask_of(tmp_path / "m.png"), np.where(SOFT > 99, 255, 0)
+    )
+
+
+def test_masks_of_a_dark_colour_are_named(tmp_path):
+    filled = (SOFT > 99)[..., None] * np.array((0, 0, 90), np.uint8)
+    cv2.imwrite(str(tmp_path / "m.png"), filled)
     with pytest.raises(DataError, match=r"m\.png.*black and white"):
         mask_of(tmp_path / "m.png")
+
+
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+def test_json_of_windows_editors_is_read(tmp_path, code):
+    path = tmp_path / "a.json"
+    path.write_bytes('{"größe": 1}'.encode(code))
+    assert read_json(path) == {"größe": 1}
+
+
+def test_matrices_may_be_nine_numbers():
+    K = [[900.0, 0, 320], [0, 900, 240], [0, 0, 1]]
+    flat = np.ravel(K).tolist()
+    np.testing.assert_array_equal(numbers("a", flat, "K", (3, 3)), K)
+    with pytest.raises(DataError, match=r"'K'.*\(3, 3\)"):
+        numbers("a", [900.0, 320, 240], "K", (3, 3))
 
 
 def test_an_image_of_more_than_8_bits_is_named(tmp_path):

@@ -108,6 +108,12 @@ def test_plain_npy_and_npz(tmp_path):
     assert list(read_npz(tmp_path / "a.npz", ["poses", "absent"])) == ["poses"]
 
 
+def test_complex_numbers_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", p=np.ones(3, complex))
+    with pytest.raises(DataError, match=r"a\.npz.*p holds complex numbers"):
+        read_npz(tmp_path / "a.npz")
+
+
 # --- what must not run -------------------------------------------------------------------------
 
 

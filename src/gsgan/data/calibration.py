@@ -346,12 +346,6 @@ def _read_dataset_json(
                 raise DataError(f"{where}: {' or '.join(names)} is missing")
             given[key] = entry[there[0]] if there else None
         width, height = numbers(where, given["size"], "size", (2,))
-
-        # Matrices may be lists of nine numbers.
-        for key in ("K", "R"):
-            values = as_floats(given[key])
-            if values.size == 9:
-                given[key] = values.reshape(3, 3)
         cameras[name] = make_camera(
             where,
             name,
@@ -436,7 +430,7 @@ def _toml_camera(
 
     # A rotation that is no matrix is a Rodrigues vector.
     R = entry["rotation"]
-    if as_floats(R).shape != (3, 3):
+    if as_floats(R).size != 9:
         R = _rotation_matrix(where, R, "rotation")
     return make_camera(
         where,

@@ -170,14 +170,14 @@ def numbers(
     key: str,
     shape: tuple[int, ...],
 ) -> Float:
-    """Finite float64 numbers of a shape; a column or row in place of a vector is flattened.
+    """Finite float64 numbers of a shape, also where they are a flat list, a column or a row.
 
     Raises:
         DataError: when they are something else.
     """
     array = as_floats(raw)
-    # A translation is often written as a column.
-    if array.size == int(np.prod(shape)) and array.ndim > len(shape):
+    # A translation is often written as a column, a matrix as nine numbers row by row.
+    if array.size == int(np.prod(shape)) and array.ndim != len(shape):
         array = array.reshape(shape)
     if array.shape != shape or not np.isfinite(array).all():
         raise DataError(

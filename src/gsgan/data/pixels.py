@@ -98,19 +98,24 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
 
 
 def read_mask_values(path: Path) -> Bytes:
-    """``[H, W]`` 0..255: a file's alpha if it varies, else its grey values.
+    """``[H, W]`` 0..255: a file's alpha if it varies, else the largest of its channels.
 
     Raises:
         DataError: if the file is missing, damaged or cut off.
     """
     # Some tools number objects by palette.
-    if read_header(path)[2] == "P":
+    mode = read_header(path)[2]
+    if mode == "P":
         return _of_palette(path)
 
     # Some tools write masks as alpha over one colour, others cut the person out of the image.
     alpha = read_alpha(path)
     if alpha is not None and alpha.min() < alpha.max():
         return alpha
+
+    # A person painted in red is as opaque as one in white.
+    if mode.startswith("RGB"):
+        return read_colour(path).max(axis=-1)
     return read_grey(path)
 
 

@@ -115,9 +115,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def read_json_value(path: Path) -> Any:
     """The content of a JSON file, of any type; errors as `read_json`."""
-    # Deep nesting is a RecursionError, other damage a ValueError.
+    # Deep nesting is a RecursionError, other damage a ValueError. From bytes, json finds out
+    # whether the text is UTF-8, UTF-16 or UTF-32.
     try:
-        return json.loads(read_text(path))
+        return json.loads(path.read_bytes())
     except OSError as error:
         raise unreadable(path, error) from None
     except (ValueError, RecursionError) as error:

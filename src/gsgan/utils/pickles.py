@@ -329,9 +329,11 @@ def read_npz(
             _expect(
                 size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes"
             )
-            arrays[name] = _read_array(
+            array = _read_array(
                 io.BytesIO(archive.read(members[name])), objects
             )
+            _expect(not np.iscomplexobj(array), f"{name} holds complex numbers")
+            arrays[name] = array
         return arrays
 
 
