@@ -260,13 +260,11 @@ def clock_errors(
         for (a, b), lag in zip(pairs, lags, strict=True):
             if c in (a, b) and np.isfinite(delay[a] - delay[b]):
                 before += lag.errors[reach]
-                at = round(delay[a] - delay[b]) + changes * (
-                    1 if c == a else -1
-                )
-                inside = np.abs(at) <= reach
-                errors += np.where(
-                    inside, lag.errors[reach + at * inside], np.inf
-                )
+                sign = 1 if c == a else -1
+                step = round(delay[a] - delay[b]) + sign * changes
+                place = np.clip(reach + step, 0, 2 * reach)
+                inside = np.abs(step) <= reach
+                errors += np.where(inside, lag.errors[place], np.inf)
         if before > 0:
             gain[c] = 1 - errors[reach] / before
             minima = _other_minima(errors, reach, SIMILAR)
@@ -280,7 +278,9 @@ def _other_minima(errors: Float, best: int, similar: float) -> Ints:
     """How far from the best place minima are that are at most ``similar`` times as high."""
     # Between the places a parabola through three squares gives the height of a minimum.
     squares = np.square(np.pad(errors, 1, constant_values=np.inf))
-    before, at, after = squares[:-2], squares[1:-1], squares[2:]
+    before = squares[:-2]
+    at = squares[1:-1]
+    after = squares[2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         lower = (before - after) ** 2 / (8 * (before - 2 * at + after))
     height = np.where(np.isfinite(lower), np.maximum(at - lower, 0), at)
@@ -342,7 +342,7 @@ def _lag_of(a: Float, b: Float, baseline: Float, reach: int) -> _Lag | None:
 
     # Where the motion repeats itself, all pairs of cameras must take the same of equal minima.
     minima = best + _other_minima(errors, reach + best, EQUAL)
-    best = int(min(best, *minima, key=abs)) if len(minima) else best
+    best = int(min([best, *minima], key=abs))
 
     # At an end of the range the best lag may lie beyond it.
     if not np.isfinite(errors[reach]) or abs(best) == reach:

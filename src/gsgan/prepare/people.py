@@ -19,9 +19,8 @@ from gsgan.utils.errors import DataError
 # Median reprojection error, thousandths of the focal length, above which two cameras show two
 # people: 15 cm at 3 m.
 SAME_PERSON = 50.0
-MIN_COMMON_JOINTS = (
-    6  # joints that a person has in common with another camera or another frame
-)
+# Joints that a person has in common with another camera or another frame.
+MIN_COMMON_JOINTS = 6
 # Steps from frame to frame, in sizes of the person: those of up to this many times the usual step,
 # and of at least this size, cost nothing.
 USUAL_STEPS = 3.0

@@ -61,9 +61,8 @@ from gsgan.utils.pickles import read_arrays
 
 STUDIED = 48  # frames that show rooms and silhouettes
 MAX_FOCAL_RATIO = 1.6  # between a camera found from the person and the median
-MIN_IMAGES = (
-    0.2  # share of the frames of the camera with most that each must have
-)
+# Share of the frames of the camera with most that each camera must have.
+MIN_IMAGES = 0.2
 MIN_ANGLE = 30.0  # degrees between the rays of cameras found from the person
 
 

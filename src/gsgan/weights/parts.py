@@ -162,9 +162,16 @@ class LayerWindow(NamedTuple):
 def _window(layer: nn.Module) -> LayerWindow:
     """The window of a convolution or a pooling."""
     assert isinstance(layer, nn.Conv2d | nn.MaxPool2d)
-    settings = (layer.kernel_size, layer.stride, layer.padding)
-    sides = [x[0] if isinstance(x, tuple) else x for x in settings]
-    return LayerWindow(*map(int, sides))
+    return LayerWindow(
+        kernel=_side(layer.kernel_size),
+        stride=_side(layer.stride),
+        padding=_side(layer.padding),
+    )
+
+
+def _side(setting: int | tuple[int, ...] | str) -> int:
+    """A setting of a layer, equal for rows and columns."""
+    return int(setting[0] if isinstance(setting, tuple) else setting)
 
 
 def _reach(layer: nn.Module, span: Span, length: int) -> tuple[Span, Span]:
