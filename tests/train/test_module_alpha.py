@@ -15,7 +15,6 @@ STEP_ONE = {
     "feature_head": 0.5,
     "perceptual": 0.0,
     "perceptual_from": 0.3,
-    "perceptual_every": 1,
 }
 NETWORKS = {
     "perceptual": 1.0,

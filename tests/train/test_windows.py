@@ -140,31 +140,3 @@ def test_step_one_has_a_perceptual_loss_where_asked(make, model):
     assert all(value > 0 for _, value in logged["step_one/perceptual"])
     plain, _, _ = make(f"model={model}")
     assert (plain.perceptual is None) == (model == "splat_only")
-
-
-def test_a_perceptual_loss_of_fewer_iterations_weighs_as_much_more(make):
-    first = {}
-    for every in (1, 3):
-        module, trainer, data = make(
-            "training.step_one.perceptual=0.5",
-            "training.step_one.perceptual_from=0",
-            f"training.step_one.perceptual_every={every}",
-            "training.schedule.segmentation=3",
-        )
-        logged = []
-        losses = module._descend
-
-        def descend(terms, *names, module=module, logged=logged, losses=losses):
-            if "step_one/perceptual" in terms:
-                logged.append(
-                    (module.step, float(terms["step_one/perceptual"]))
-                )
-            losses(terms, *names)
-
-        module._descend = descend
-        trainer.fit(module, data)
-        steps, values = zip(*logged, strict=True)
-        assert all(step % every == 0 for step in steps)
-        assert steps[0] == 3
-        first[every] = values[0]
-    assert first[3] == pytest.approx(3 * first[1], rel=1e-5)

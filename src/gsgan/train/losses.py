@@ -32,7 +32,6 @@ class StepOneLoss:
         feature_head, alpha, perceptual: weights, see conf/training/_base.yaml; 0 builds no readout
             of F, and no perceptual network for Step I.
         perceptual_from: share of Step I without the perceptual loss.
-        perceptual_every: iterations from one perceptual loss to the next.
 
     Source: paper Sec. 3.5 (λ = 0.2), without readout, alpha and the perceptual loss.
     """
@@ -43,11 +42,9 @@ class StepOneLoss:
     alpha: float
     perceptual: float
     perceptual_from: float
-    perceptual_every: int
 
     def __post_init__(self) -> None:
         at_least("training.step_one.perceptual", self.perceptual, 0)
-        integer("training.step_one.perceptual_every", self.perceptual_every, 1)
         between("training.step_one.perceptual_from", self.perceptual_from, 0, 1)
 
     def __call__(

@@ -331,16 +331,13 @@ class AvatarTraining(LightningModule):
         # L_Ψ and, in the later part of Step I, L_perc of the same image.
         terms = {"step_one/loss": self.step_one_loss(rendering, frame)}
 
-        # The perceptual loss joins after a share of Step I, and is weighted as much more as it is
-        # computed less often.
-        every = self.step_one.perceptual_every
-        weight = self.step_one.perceptual * every
+        # The perceptual loss joins after a share of Step I.
+        weight = self.step_one.perceptual
         done = self.schedule.share_of_step_one(self.step)
         if (
             self.perceptual is not None
             and weight
             and done >= self.step_one.perceptual_from
-            and self.step % every == 0
         ):
             assert rendering.colour is not None
             draws = self._crop_draws(len(frame))
