@@ -55,6 +55,7 @@ from gsgan.model.avatar import Avatar
 from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
+from gsgan.utils.threads import map_threads
 from gsgan.weights.networks import Lpips
 
 # Reasons for missing scores.
@@ -414,18 +415,20 @@ class Tally:
         if last is not None and _follows(item, frame, last.item, last.frame):
             mask = last.frame.mask
             motion = truth_motion(target, frame.mask, last.target, mask)
-        for name, image in images.items():
-            variant_scores = image_scores(
-                image,
-                target,
-                frame.mask,
-                box,
-                regions=regions,
-                parts=parts,
-                measures=prepare.measures,
-                lpips=lpips,
-            )
-
+        score = partial(
+            image_scores,
+            target=target,
+            mask=frame.mask,
+            box=box,
+            regions=regions,
+            parts=parts,
+            measures=prepare.measures,
+            lpips=lpips,
+        )
+        scores = map_threads(score, images.values())
+        for (name, image), variant_scores in zip(
+            images.items(), scores, strict=True
+        ):
             # The same variant of the frame before.
             if last is not None and motion is not None:
                 before = (last.images[name], last.target, last.frame.mask)
