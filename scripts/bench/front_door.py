@@ -47,7 +47,7 @@ from gsgan.skeleton.joints import (
     joint_names,
 )
 from gsgan.synthetic.camera import SceneCamera
-from gsgan.synthetic.scene_setup import Scene, SceneSettings, ring
+from gsgan.synthetic.scene_setup import Scene, SceneSettings, front, ring
 from gsgan.synthetic.scenes import _calibration as calibration
 from gsgan.utils.files import write_json, write_npz
 
@@ -110,8 +110,10 @@ class Film:
             for frame in range(1, len(scene.times), 15):
                 points.append(scene.mesh(frame)[0][::24])
 
-        # Cameras that see the person in all clips.
-        views = ring(scene_settings, np.concatenate(points))
+        # Cameras that see the person in all clips. Two stand before the person: opposite ones
+        # would not show where a point is between them.
+        stand = front if settings.cameras == 2 else ring
+        views = stand(scene_settings, np.concatenate(points))
         names = [f"cam{k + 1:02d}" for k in range(settings.cameras)]
         self.views = dict(zip([*names, TEST_CAMERA], views, strict=True))
         self.names = names
