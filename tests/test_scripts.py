@@ -15,7 +15,13 @@ from gsgan.synthetic.takes import MOTIONS
 @pytest.mark.parametrize(
     "words",
     [
-        ("big_data", "--frames=200", "--cameras=2", "--reads=160"),
+        (
+            "big_data",
+            "--frames=200",
+            "--cameras=2",
+            "--reads=160",
+            "--workers=1",
+        ),
         pytest.param(
             ("sweeps", "joblib", "--runs=4", "--kills=1"),
             marks=pytest.mark.slow,
