@@ -99,6 +99,8 @@ def prepare(options: Options, console: Console | None = None) -> Path:
         return out
 
     # Joints, cameras and masks, from one camera or from several.
+    if inputs is not None and options.offsets:
+        options = replace(options, offsets=options.offsets_of(inputs.sources))
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     if inputs is None:
         solved = _from_one_video(options, stages, console)
