@@ -11,6 +11,7 @@ from conventions import CONVENTIONS as BVH
 from conventions import write_bvh
 from mannequin import choreography, mannequin
 from scipy.spatial.transform import Rotation
+from test_gltf import STYLES
 from tiny_glb import BONES, TinyGlb
 
 from gsgan.motion.character import Animation
@@ -53,6 +54,21 @@ def test_any_convention_is_the_same_motion(
     assert read.part == ""
     limit = 3e-3 if name == "shorts" else 1e-3
     assert np.abs(read.p - bvh.p).max() < limit
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_names_of_other_rigs_are_the_same_motion(
+    tmp_path, person, acted, proportions, expected, style
+):
+    def name(bone: str) -> str:
+        return STYLES[style].get(bone, f"other {bone}")
+
+    path = write_gltf(tmp_path / "a.glb", person, acted, STEP, name=name)
+    source = Source(proportions)
+    read, bvh = read_motion(path, source), read_motion(expected, source)
+    limbs = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
+    apart = np.linalg.norm((read.p - bvh.p)[:, limbs], axis=-1)
+    assert np.median(apart) < 0.02
 
 
 def test_a_character_of_the_dataset_moves_alike(

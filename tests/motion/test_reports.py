@@ -359,3 +359,20 @@ def test_markers_without_a_trunk_are_named(tmp_path, landmarks, proportions):
     )
     with pytest.raises(DataError, match=r"LElbow.*RWrist"):
         read_motion(path, Source(proportions))
+
+
+def test_decimal_commas_are_read_as_points(tmp_path):
+    text = BVH.replace("{chest}", "0.5 12.25 -1e-05")
+    path = tmp_path / "a.bvh"
+    path.write_text(text)
+    points = read_bvh(path)
+    path.write_text(text.replace(".", ","))
+    commas = read_bvh(path)
+    assert commas.frame_time == points.frame_time
+    np.testing.assert_array_equal(commas.root, points.root)
+    np.testing.assert_array_equal(commas.local, points.local)
+
+    # Commas that are no decimal ones are refused.
+    path.write_text(text.replace("0 91 0", "0,5 1.5 0"))
+    with pytest.raises(DataError, match="'0,5'"):
+        read_bvh(path)

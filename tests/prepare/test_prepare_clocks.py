@@ -185,25 +185,26 @@ def test_a_project_with_a_camera_of_twice_the_rate(tmp_path):
 # ------------------------------------------------ late clocks
 
 
-def walk(time: np.ndarray) -> np.ndarray:
-    """``[F, 33, 3]`` a person who moves all joints, at times in frames."""
+def walk(time: np.ndarray, size: float = 1.0) -> np.ndarray:
+    """``[F, 33, 3]`` a person who moves all joints, at times in frames; ``size`` 0 stands still."""
     seconds = time / 30
     p = np.repeat(skeletons(2)[:1], len(time), axis=0)
-    p[:, :, 0] += 0.8 * np.sin(0.7 * seconds)[:, None]
-    p[:, :, 1] += 0.8 * np.cos(0.9 * seconds)[:, None]
+    p[:, :, 0] += size * 0.8 * np.sin(0.7 * seconds)[:, None]
+    p[:, :, 1] += size * 0.8 * np.cos(0.9 * seconds)[:, None]
     for j in range(33):
         turn = np.pi * (1 + (7 * j) % 5 / 5) * seconds
         ways = [np.sin(turn + j), np.cos(turn + 2 * j), np.sin(turn + 3 * j)]
-        p[:, j] += 0.12 * np.stack(ways, axis=-1)
+        p[:, j] += size * 0.12 * np.stack(ways, axis=-1)
     return p
 
 
-def filmed(times, noise: float = 3.0):
+def filmed(times, noise: float = 3.0, size: float = 1.0):
     """A rig whose cameras show the person at ``times [C, F]``: ``uv`` and confidence."""
     cameras = ring()[: len(times)]
     uv = []
     for camera, time in zip(cameras, times, strict=True):
-        uv.append(seen([camera], p=walk(np.asarray(time, float)))[2][0])
+        p = walk(np.asarray(time, float), size)
+        uv.append(seen([camera], p=p)[2][0])
     uv = np.stack(uv)
     uv += noise * np.random.default_rng(0).standard_normal(uv.shape)
     return CameraArray.of(cameras), uv, np.ones(uv.shape[:3])
@@ -217,8 +218,11 @@ FRAMES = np.arange(120)
     [(0, 10.3, 0), (0, 0.6, 0, 0), (0, 2.5, 0, -7.2), (0, 12.4), (0, 0, 0)],
 )
 def test_late_clocks_are_measured_to_a_tenth_of_a_frame(late):
-    delay, gain, other = clock_errors(*filmed([FRAMES + d for d in late]))
+    delay, gain, other, error = clock_errors(
+        *filmed([FRAMES + d for d in late])
+    )
     np.testing.assert_allclose(delay, late, atol=0.1)
+    assert (error < 0.1).all()
     assert (gain[np.array(late) > 1] > 0.3).all()
     assert np.isnan(other).all()
 
@@ -250,6 +254,7 @@ def test_a_clock_that_is_a_frame_late_is_an_error(delay, offsets, wrong):
                 delay=np.array([0.0, delay]),
                 gain=np.array([0.0, 0.5]),
                 other=np.array([np.nan, np.nan]),
+                error=np.array([0.1, 0.1]),
             )
         ),
     )
@@ -279,7 +284,61 @@ def test_a_motion_that_repeats_itself_has_other_delays(period, late):
         solution=SimpleNamespace(clocks=clocks),
     )
     notes = late_clocks(outcome).notes
-    assert all("the motion repeats itself" in note for note in notes)
+    advice = [note for note in notes if "set offsets" in note]
+    assert all("the motion repeats itself" in note for note in advice)
+
+
+def said_of(clocks: ClockErrors):
+    """What the command says of the clocks of cameras in every frame."""
+    names = [f"cam{c}" for c in range(len(clocks.delay))]
+    outcome = SimpleNamespace(
+        frames=np.arange(10),
+        inputs=SimpleNamespace(sources=names),
+        options=SimpleNamespace(offsets=None),
+        solution=SimpleNamespace(clocks=clocks),
+    )
+    return late_clocks(outcome)
+
+
+@pytest.mark.parametrize("frames", [40, 120])
+@pytest.mark.parametrize("size", [0, 0.01, 0.03, 0.1, 0.3, 1])
+@pytest.mark.parametrize("speed", [0.1, 0.25, 1])
+@pytest.mark.parametrize("late", [(0, -3.3), (0, 0.6, 0, -3.3)])
+def test_a_delay_that_is_measured_wrong_is_doubtful(frames, size, speed, late):
+    """Slow motion and a person who hardly moves: nothing is advised that the motion does not
+    show."""
+    times = [speed * (np.arange(frames) + d) for d in late]
+    clocks = clock_errors(*filmed(times, size=size))
+    off = clocks.delay - late
+    off = np.abs(off - off[0])
+    said = said_of(clocks)
+    notes = " ".join(said.notes)
+    doubtful = "how late clocks are is uncertain" in notes
+    if not off.max() < 0.3:
+        assert doubtful
+    if size == 0:
+        assert "set offsets" not in notes
+    if size == speed == 1:
+        assert not doubtful
+
+
+@pytest.mark.parametrize("frames", [40, 120, 300])
+def test_a_camera_of_another_rate_is_an_error(frames):
+    """60 frames a second that are played at 30, without time stamps that say so."""
+    time = np.arange(frames)
+    said = said_of(clock_errors(*filmed([time, time / 2, time, time])))
+    assert said.wrong
+    assert "at another rate" in said.notes[0]
+    assert "set offsets" not in " ".join(said.notes)
+
+
+def test_clocks_without_a_frame_in_common_are_doubtful():
+    cameras, uv, conf = filmed([FRAMES, FRAMES])
+    conf[0, :60] = 0
+    conf[1, 60:] = 0
+    said = said_of(clock_errors(cameras, uv, conf))
+    assert not said.wrong
+    assert "cam0 unknown, cam1 unknown" in said.notes[0]
 
 
 def test_a_camera_that_loses_frames_without_a_gap_is_named():

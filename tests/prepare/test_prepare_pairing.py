@@ -1,11 +1,14 @@
 """Videos find their calibrated cameras by name."""
 
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from capture_scenes import ring
 
+from gsgan.prepare.options import Options
 from gsgan.prepare.sources import (
     Metadata,
     Recording,
@@ -113,3 +116,13 @@ def test_a_folder_named_as_a_video_is_none(tmp_path):
     (tmp_path / "cam01.mp4").mkdir()
     with pytest.raises(DataError, match="holds no videos"):
         find_sources(tmp_path)
+
+
+def test_accents_may_be_stored_in_two_ways():
+    composed = unicodedata.normalize("NFC", "caméra")
+    apart = unicodedata.normalize("NFD", "caméra")
+    assert pair_cameras([apart], [composed, "b"], {}) == {apart: composed}
+    given = {composed: "b"}
+    assert pair_cameras([apart], [composed, "b"], given) == {apart: "b"}
+    settings = SimpleNamespace(offsets={composed: 2})
+    assert Options.offsets_of(settings, [apart]) == {apart: 2}

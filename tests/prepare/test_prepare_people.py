@@ -11,8 +11,12 @@ from make import skeletons
 
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.options import Inputs
-from gsgan.prepare.people import find_jumps, one_person
-from gsgan.prepare.run import with_detections, with_one_person
+from gsgan.prepare.people import compare_people, find_jumps, one_person
+from gsgan.prepare.run import (
+    _first_look,
+    with_detections,
+    with_one_person,
+)
 from gsgan.prepare.sources import Recording
 from gsgan.skeleton.joints import ALL, BODY
 from gsgan.utils.errors import DataError
@@ -100,6 +104,36 @@ def test_a_person_who_takes_over_jumps():
     p[3] += 2.0  # one frame is no other person
     assert find_jumps(p, time) == [FRAMES]
     assert find_jumps(p, 10 * time) == []
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize(
+    ("sizes", "errors"),
+    [
+        ((1, 1, 1), 0),  # films of one person that were cut together
+        ((1, 0.97, 1), 0),
+        ((1, 1.12, 1.12), 1),
+        ((1, 0.88, 1), 2),
+    ],
+)
+def test_another_person_is_told_by_the_limbs(sizes, errors, noise):
+    clips = []
+    for k, size in enumerate(sizes):
+        clips.append(size * skeletons(20) + [1.2 * (k % 2), 0, 0])
+    p = np.concatenate(clips)
+    p += noise * np.random.default_rng(0).standard_normal(p.shape)
+    _, _, uv, conf = seen(ring(), p=p)
+    calibration = SimpleNamespace(path=Path("rig.toml"))
+    inputs = Inputs({}, calibration, ring(), (), 30.0)
+    look = _first_look(inputs, np.arange(100, 160), uv, conf)
+    assert "elsewhere from frame 119 to 120, as in 2 frames" in look.notes[0]
+    assert len(look.errors) == errors
+    assert all("another person follows from frame 1" in e for e in look.errors)
+
+
+def test_limbs_of_few_frames_are_not_compared():
+    p = np.concatenate([skeletons(20), 1.2 * skeletons(9)])
+    assert compare_people(p, [20]) == {}
 
 
 def test_one_person_is_left_alone():

@@ -27,7 +27,7 @@ from gsgan.data.reconstructions import (
 )
 from gsgan.utils.arrays import Float, as_floats
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import read_json, read_text
+from gsgan.utils.files import is_json_object, read_json, read_text
 
 # Metres in one unit.
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -262,8 +262,12 @@ def read_cameras(
         if not isinstance(entry, dict) or not {"K", "R", "t", "size"} <= set(
             entry
         ):
+            there = (
+                ", ".join(list(entry)[:8]) if isinstance(entry, dict) else ""
+            )
             raise DataError(
-                f"{where}: expected an object with K, R, t, dist and size"
+                f"{where}: expected an object with K, R, t, dist and size, found "
+                f"{there or type(entry).__name__}"
             )
 
         # A lens by another name would be ignored.
@@ -728,11 +732,11 @@ FORMATS: dict[str, tuple[Callable[[Path, str], bool], Reader]] = {
     "nerfstudio": (lambda _, head: is_nerfstudio(head), _read_nerfstudio),
     "JSON of Panoptic or THuman4.0": (
         lambda _, head: (
-            head.lstrip().startswith("{")
+            is_json_object(head)
             and ('"imgSize"' in head or '"resolution"' in head)
         ),
         _read_dataset_json,
     ),
-    "cameras.json": (lambda _, head: head.lstrip().startswith("{"), _read_json),
+    "cameras.json": (lambda _, head: is_json_object(head), _read_json),
     "TOML": (lambda _, head: "[" in head and "matrix" in head, _read_toml),
 }

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.utils.arrays import Float
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import read_json, read_text
+from gsgan.utils.files import is_json_object, read_json, read_text
 from gsgan.utils.frame_files import CAMERA_WORDS
 
 # COLMAP's camera models in the order of their numbers, with the numbers of their parameters.
@@ -426,9 +426,7 @@ def _view(
 
 def is_nerfstudio(head: str) -> bool:
     """Whether the start of a file is that of a scene of nerfstudio."""
-    return head.lstrip().startswith("{") and bool(
-        re.search(r'"frames"\s*:\s*\[', head)
-    )
+    return is_json_object(head) and bool(re.search(r'"frames"\s*:\s*\[', head))
 
 
 def read_nerfstudio(path: Path, scale: float) -> dict[str, CameraEntry]:

@@ -9,7 +9,7 @@ import numpy as np
 from gsgan.motion.rotations import Array, rotation
 from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import read_text
+from gsgan.utils.files import read_text, with_decimal_points
 
 # seconds between two frames from which the number is read as a rate
 SLOWEST = 1.0
@@ -41,7 +41,7 @@ def read_bvh(path: Path) -> RigMotion:
         ) from error
     try:
         # Some programs end the file with control characters, as DOS did.
-        text = text.rstrip("\x1a\0 \r\n\t")
+        text = with_decimal_points(text.rstrip("\x1a\0 \r\n\t"))
         hierarchy, *motion = re.split(r"\bMOTION\b", text, maxsplit=1)
 
         # Braces may touch other words.

@@ -14,7 +14,7 @@ from gsgan.motion.clip import rate_of
 from gsgan.skeleton.joints import BODY, is_known, zeros_as_missing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import ConfigError, DataError, GsganError
-from gsgan.utils.files import read_text
+from gsgan.utils.files import read_text, with_decimal_points
 from gsgan.utils.frame_files import frame_files
 
 Float = NDArray[np.float64]
@@ -117,7 +117,8 @@ def read_points3d(path: Path) -> Points3D:
 
 def _read_trc(path: Path) -> Markers:
     try:
-        lines = read_text(path, errors="replace").splitlines()
+        text = with_decimal_points(read_text(path, errors="replace"))
+        lines = text.splitlines()
         header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
         if "\t" not in lines[3]:
             raise ValueError("its columns are not separated by tabs")

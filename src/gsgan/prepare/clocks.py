@@ -1,6 +1,6 @@
 """Time: common frame numbers by the time stamps of videos, and cameras whose clocks are late."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
@@ -40,6 +40,8 @@ DRIFT = 0.7  # frames between the first and the last third: a clock that is not 
 DRIFT_LAG = 6  # frames by which it may change, either way
 DRIFT_GAIN = 0.1  # share of the error of a third that the change must explain
 THIRDS = 3
+PARTS = 12  # of the frames: by how much they differ, a delay is uncertain
+FLAT = 1.25  # times the least error: if half of the lags fit so well, its place is noise
 
 
 class Timed(NamedTuple):
@@ -197,11 +199,14 @@ class ClockErrors(NamedTuple):
         delay: frames, NaN where it is unknown.
         gain: the share by which the median error falls when the delay is corrected.
         other: frames, a delay that fits nearly as well where the motion repeats itself, else NaN.
+        error: frames, the standard error of the delay by parts of the recording, joints and pairs
+            of cameras; infinite where the cameras fit alike at all delays, NaN as ``delay``.
     """
 
     delay: Float
     gain: Float
     other: Float
+    error: Float
 
 
 def clock_errors(
@@ -225,9 +230,10 @@ def clock_errors(
     delay = np.full(C, np.nan)
     gain = np.full(C, np.nan)
     other = np.full(C, np.nan)
+    error = np.full(C, np.nan)
     reach = min(max_lag, F // 2)
     if reach < 1:
-        return ClockErrors(delay, gain, other)
+        return ClockErrors(delay, gain, other, error)
 
     # The rays of all detections, in the world.
     seen = is_known(uv) & (weight > 0)
@@ -248,10 +254,11 @@ def clock_errors(
             pairs.append((a, b))
             lags.append(pair_lag)
     if not pairs:
-        return ClockErrors(delay, gain, other)
+        return ClockErrors(delay, gain, other, error)
 
     # Delays whose differences are the lags of the pairs.
     delay = _delays(C, np.array(pairs), np.array([lag.best for lag in lags]))
+    error = _delay_errors(delay, pairs, lags)
     changes = np.arange(-reach, reach + 1)
     for c in range(C):
         # The error of the camera's pairs by how much its delay is changed.
@@ -271,7 +278,7 @@ def clock_errors(
             if len(minima):
                 lowest = errors[reach + minima].argmin()
                 other[c] = delay[c] + minima[lowest]
-    return ClockErrors(delay, gain, other)
+    return ClockErrors(delay, gain, other, error)
 
 
 def _other_minima(errors: Float, best: int, similar: float) -> Ints:
@@ -293,6 +300,7 @@ class _Lag(NamedTuple):
     """How well a camera fits another one, some frames before or after."""
 
     best: float  # frames
+    error: float  # its standard error
     errors: Float  # [2 reach + 1] medians; inf where too few joints are seen
 
 
@@ -351,20 +359,45 @@ def _lag_of(a: Float, b: Float, baseline: Float, reach: int) -> _Lag | None:
     # The same joints at three lags. Residuals are nearly linear in time; a joint whose residual
     # neither changes its sign nor becomes small contradicts every lag.
     three = np.stack([residuals(best + step) for step in (-1, 0, 1)])
-    three = three[:, np.isfinite(three).all(0)]
+    seen = np.isfinite(three).all(0)
+    three = np.where(seen, three, 0.0)
     smallest = np.abs(three).min(0)
     changes = np.sign(three).min(0) < np.sign(three).max(0)
     limit = LAG_OUTLIER * errors[reach + best]
-    used = three[:, changes | (smallest <= limit)]
-    if used.shape[1] < MIN_MATCHES:
+    used = seen & (changes | (smallest <= limit))
+    if used.sum() < MIN_MATCHES:
         return None
-    squares = (used**2).mean(-1)
+    squares = np.where(used, three**2, 0.0)
+    vertex, error = _vertex(squares)
 
-    # The vertex of the parabola through their mean squares.
-    before, at, after = squares.tolist()
-    curvature = before - 2 * at + after
-    vertex = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
-    return _Lag(best + float(np.clip(vertex, -1, 1)), errors)
+    # The least of many lags is always a minimum, also of noise.
+    if np.median(errors[np.isfinite(errors)]) < FLAT * errors[reach + best]:
+        error = np.inf
+    return _Lag(best + float(np.clip(vertex, -1, 1)), error, errors)
+
+
+def _vertex(squares: Float) -> tuple[float, float]:
+    """The vertex of the parabola through the sums at -1, 0 and 1, and its standard error.
+
+    The error is the larger one of those by how parts of the recording, and joints, differ.
+
+    Args:
+        squares: ``[3, n, J]`` of n frames and J joints.
+    """
+    before, at, after = squares
+    slope = before - after
+    bend = before - 2 * at + after
+    curvature = float(bend.sum())
+    if curvature <= 0:
+        return 0.0, np.inf
+    vertex = 0.5 * float(slope.sum()) / curvature
+
+    # The part of each frame and joint in what moves the vertex.
+    moves = 0.5 * (slope - 2 * vertex * bend) / curvature
+    by_time = [part.sum() for part in np.array_split(moves, PARTS)]
+    by_joint = moves.sum(0)
+    error = max(np.linalg.norm(by_time), np.linalg.norm(by_joint))
+    return vertex, max(float(error), abs(vertex) - 1)
 
 
 def _delays(C: int, pairs: Ints, lags: Float) -> Float:
@@ -392,6 +425,23 @@ def _delays(C: int, pairs: Ints, lags: Float) -> Float:
     ordered = np.sort(delay[paired])
     result = np.full(C, np.nan)
     result[paired] = delay[paired] - ordered[(len(ordered) - 1) // 2]
+    return result
+
+
+def _delay_errors(
+    delay: Float, pairs: Sequence[tuple[int, int]], lags: Sequence[_Lag]
+) -> Float:
+    """The standard error ``[C]`` of delays, which those of the pairs and their contradictions make;
+    NaN for cameras without a pair."""
+    result = np.full(len(delay), np.nan)
+    for c in range(len(delay)):
+        squares = []
+        for (a, b), lag in zip(pairs, lags, strict=True):
+            if c in (a, b):
+                off = delay[a] - delay[b] - lag.best
+                squares.append(off**2 + lag.error**2)
+        if squares:
+            result[c] = np.sqrt(np.mean(squares))
     return result
 
 

@@ -177,7 +177,7 @@ def solve_video(
         error=error,
         flips=np.zeros((1, F, len(FLIP_GROUPS) + 1), bool),
         left_out=np.zeros((1, F, 2), bool),
-        clocks=ClockErrors(*np.full((3, 1), np.nan)),
+        clocks=ClockErrors(*np.full((4, 1), np.nan)),
         stages={"fitted": error[:, :, :BODY]},
         removed=removed,
         frontier=(np.nan, np.nan),

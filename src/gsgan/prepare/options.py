@@ -1,6 +1,6 @@
 """The options of `gsgan.prepare`, and the images and cameras that they name."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from gsgan.prepare.sources import (
     pair_cameras,
     recording_notes,
     refuse_unread,
+    spell_as,
     upright,
 )
 from gsgan.skeleton.proportions import UP_AXES
@@ -180,6 +181,13 @@ class Options(CommandOptions):
             if key not in FREE_OPTIONS
         }
 
+    def offsets_of(self, sources: Iterable[str]) -> dict[str, int]:
+        """The offsets, with the names of cameras spelt as those of the ``sources``."""
+        offsets = self.offsets or {}
+        return {
+            spell_as(name, sources): frames for name, frames in offsets.items()
+        }
+
     def folder(self, name: str) -> Path:
         """The path that a key holds."""
         return Path(str(getattr(self, name))).expanduser().absolute()
@@ -207,7 +215,7 @@ def read_inputs(options: Options) -> Inputs:
     """
     folder = options.folder("source")
     sources = find_sources(folder, options.apply_rotation)
-    unknown = sorted(set(options.offsets or {}) - set(sources))
+    unknown = sorted(set(options.offsets_of(sources)) - set(sources))
     if unknown:
         raise ConfigError(
             f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}"

@@ -13,6 +13,7 @@ from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.triangulate import plain
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.joints import BODY, is_known
+from gsgan.skeleton.proportions import HIPS, SHOULDERS
 from gsgan.utils.arrays import Float
 from gsgan.utils.errors import DataError
 
@@ -32,6 +33,19 @@ MAX_FAILED = 0.5  # share of the frames with several people in which no two came
 MAX_JUMP = 0.5
 MAX_SPEED = 12.0
 STAYS = 3  # frames before and after a jump, of which all must be apart
+# Share by which half of the limbs must differ in length for another person; detections of one
+# person differ by up to 3 % from clip to clip.
+OTHER_LENGTHS = 0.05
+MIN_CLIP = 10  # frames with which a limb is measured
+# Limbs as pairs of joints, whose two sides are alike.
+LENGTHS = (
+    ((11, 13), (12, 14)),
+    ((13, 15), (14, 16)),
+    ((23, 25), (24, 26)),
+    ((25, 27), (26, 28)),
+    (SHOULDERS,),
+    (HIPS,),
+)
 
 
 class _Group(NamedTuple):
@@ -139,6 +153,38 @@ def find_jumps(p: Float, time: Float) -> list[int]:
         if min(apart) > reach:
             jumps.append(int(rows[k]))
     return jumps
+
+
+def compare_people(p: Float, jumps: Sequence[int]) -> dict[int, float]:
+    """By which share limbs are longer or shorter after each jump of a person, in the median.
+
+    Args:
+        p: ``[F, J, 3]``, NaN = not seen.
+        jumps: of `find_jumps`; those with too few frames before or after are left out.
+    """
+    lengths = _limb_lengths(p)
+    shares = {}
+    for start, row, stop in zip(
+        (0, *jumps[:-1]), jumps, (*jumps[1:], len(p)), strict=True
+    ):
+        ratios = []
+        for length in lengths:
+            before = length[start:row][np.isfinite(length[start:row])]
+            after = length[row:stop][np.isfinite(length[row:stop])]
+            if min(len(before), len(after)) >= MIN_CLIP:
+                ratios.append(np.median(after) / np.median(before))
+        if 2 * len(ratios) >= len(lengths):
+            shares[row] = float(np.median(np.abs(np.log(ratios))))
+    return shares
+
+
+def _limb_lengths(p: Float) -> list[Float]:
+    """The length ``[F]`` of each of `LENGTHS` in joints ``[F, J, 3]``; NaN = not seen."""
+    lengths = []
+    for sides in LENGTHS:
+        ends = np.stack([p[:, b] - p[:, a] for a, b in sides])
+        lengths.append(np.linalg.norm(ends, axis=-1).mean(0))
+    return lengths
 
 
 def _move(before: Float, after: Float) -> float:

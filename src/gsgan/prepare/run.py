@@ -44,7 +44,13 @@ from gsgan.prepare.options import (
     Options,
     read_inputs,
 )
-from gsgan.prepare.people import find_crowds, find_jumps, one_person
+from gsgan.prepare.people import (
+    OTHER_LENGTHS,
+    compare_people,
+    find_crowds,
+    find_jumps,
+    one_person,
+)
 from gsgan.prepare.solve import Solution, solve
 from gsgan.prepare.sources import Recording, stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
@@ -99,6 +105,8 @@ def prepare(options: Options, console: Console | None = None) -> Path:
         return out
 
     # Joints, cameras and masks, from one camera or from several.
+    if inputs is not None and options.offsets:
+        options = replace(options, offsets=options.offsets_of(inputs.sources))
     stages = StageFolder(out.parent / f".{out.name}.prepare")
     if inputs is None:
         solved = _from_one_video(options, stages, console)
@@ -118,6 +126,7 @@ def prepare(options: Options, console: Console | None = None) -> Path:
     write_files(root, outcome, key)
     numbers = summarise(outcome) | solved.numbers
     numbers["errors"] = [
+        *solved.errors,
         *_clock_errors(outcome, solved.drift),
         *_short_cameras(outcome),
     ]
@@ -153,6 +162,7 @@ class Solved(NamedTuple):
     solution: Solution
     drift: Float  # [C] of each camera's clock, see `unsteady_clocks`
     numbers: dict[str, object]  # for prepare.json
+    errors: list[str]  # a sentence for each thing that must be corrected
 
 
 def _from_one_video(
@@ -169,6 +179,7 @@ def _from_one_video(
         solution=filmed.solution,
         drift=np.zeros(1),
         numbers={"one_camera": filmed.numbers},
+        errors=[],
     )
 
 
@@ -194,7 +205,8 @@ def _from_several(
         inputs = _in_metres(options, inputs, uv, conf)
 
     # The joints, and the clocks of the cameras.
-    inputs = _with_first_look(inputs, frames, uv, conf)
+    look = _first_look(inputs, frames, uv, conf)
+    inputs = replace(inputs, notes=[*inputs.notes, *look.notes])
     silhouettes = _silhouettes(options, inputs.sources, masks)
     alphas = silhouettes.alphas
     solution = _solve_frames(options, inputs, frames, uv, conf, alphas, console)
@@ -210,6 +222,7 @@ def _from_several(
             conf[:, :, :BODY],
         ),
         numbers={},
+        errors=look.errors,
     )
 
 
@@ -613,10 +626,19 @@ def _solve_frames(
         )
 
 
-def _with_first_look(
-    inputs: Inputs, frames: Ints, uv: Float, conf: Float
-) -> Inputs:
-    """The inputs with a note on a person who jumps, by a quick solution, see `_undistort`.
+class _Look(NamedTuple):
+    """What is said of a recording before it is solved, in sentences."""
+
+    notes: list[str]
+    errors: list[str]
+
+
+def _first_look(inputs: Inputs, frames: Ints, uv: Float, conf: Float) -> _Look:
+    """A note on a person who jumps, and an error if another one follows, by a quick solution.
+
+    Args:
+        inputs: with C cameras.
+        frames, uv, conf: see `_undistort`.
 
     Raises:
         DataError: on cameras in a wrong unit, before the long solution begins.
@@ -625,15 +647,25 @@ def _with_first_look(
     C, F, J = uv.shape[:3]
     p = plain(cameras, uv.reshape(C, -1, 2), conf.reshape(C, -1))
     _check_distance(inputs, p)
-    jumps = find_jumps(p.reshape(F, J, 3)[:, :BODY], frames / inputs.fps)
+    body = p.reshape(F, J, 3)[:, :BODY]
+    jumps = find_jumps(body, frames / inputs.fps)
     if not jumps:
-        return inputs
+        return _Look([], [])
+
+    # Limbs tell another person from films of one person that were cut together.
+    errors = []
+    for row, share in compare_people(body, jumps).items():
+        if share > OTHER_LENGTHS:
+            errors.append(
+                f"another person follows from frame {frames[row]}, whose limbs are {share:.0%} "
+                "longer or shorter in the median; prepare each person alone with frames="
+            )
     before, after = frames[jumps[0] - 1], frames[jumps[0]]
     note = (
         f"doubtful: the person is elsewhere from frame {before} to {after}, as in {len(jumps)} "
         "frames: another person may follow; prepare each part alone with frames="
     )
-    return replace(inputs, notes=[*inputs.notes, note])
+    return _Look([note], errors)
 
 
 def _check_distance(inputs: Inputs, p: Float) -> None:

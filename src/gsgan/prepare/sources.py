@@ -1,6 +1,7 @@
 """The recordings: one video or one folder of images per camera, and which camera took which."""
 
 import re
+import unicodedata
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -274,7 +275,9 @@ def pair_cameras(
     """
     # Given pairs must name sources and cameras that exist.
     both = f"videos: {', '.join(sources)}; calibration: {', '.join(cameras)}"
-    named = {str(source): str(camera) for source, camera in given.items()}
+    named = {}
+    for source, camera in given.items():
+        named[spell_as(str(source), sources)] = spell_as(str(camera), cameras)
     for source, camera in named.items():
         if source not in sources or camera not in cameras:
             raise DataError(
@@ -301,14 +304,27 @@ def pair_cameras(
 
 def matching_cameras(source: str, cameras: Sequence[str]) -> list[str]:
     """The calibrated cameras that a source's name fits, see `pair_cameras`."""
-    if source in cameras:
-        return [source]
+    spelt = spell_as(source, cameras)
+    if spelt in cameras:
+        return [spelt]
 
     # The same name, or a word of the source's name.
     name = source.lower()
     words = re.split(r"[^0-9a-z]+", name)
     same = [camera for camera in cameras if camera.lower() == name]
     return same or [camera for camera in cameras if camera.lower() in words]
+
+
+def spell_as(name: str, names: Iterable[str]) -> str:
+    """The one of ``names`` that looks as ``name``, else ``name`` itself.
+
+    macOS stores an accent as a character of its own, keyboards write one character.
+    """
+    looks = unicodedata.normalize("NFC", name)
+    for other in names:
+        if unicodedata.normalize("NFC", other) == looks:
+            return other
+    return name
 
 
 def fit_size(

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from gsgan.check.report import Table
 from gsgan.data.skeletons import usual_step
-from gsgan.prepare.camera_array import CameraArray, camera_moves
+from gsgan.prepare.camera_array import MIN_VIEWS, CameraArray, camera_moves
 from gsgan.prepare.dataset import Outcome
 from gsgan.prepare.solve import Solution, median
 from gsgan.skeleton import MEDIAPIPE33
@@ -21,6 +21,13 @@ DELAY = 0.5  # frames: larger delays of a clock are noted
 # themselves can make a clock seem three quarters of one late.
 LATE = 0.9
 DELAY_GAIN = 0.05  # share of the error that correcting a delay must remove
+# A delay is trusted to this many standard errors, and doubtful if that is more frames than here.
+TRUST = 2.0
+UNCERTAIN = 0.3
+# Frames: so uncertain a delay whose correction removes this share of the error is that of a camera
+# whose time runs otherwise.
+OTHER_RATE = 2.0
+OTHER_RATE_GAIN = 0.2
 
 
 def summarise(outcome: Outcome) -> dict[str, Any]:
@@ -113,17 +120,30 @@ class LateClocks(NamedTuple):
 
 
 def late_clocks(outcome: Outcome) -> LateClocks:
-    """A note on the cameras whose clocks are late, with the offsets that correct all of them."""
+    """Notes on the cameras whose clocks are late, with the offsets that correct all of them, and on
+    those of which that is doubtful."""
+    if len(outcome.inputs.sources) < MIN_VIEWS:
+        return LateClocks([], False)
+
     # Delays are counted in the chosen frames, of which only every n-th may be there.
     step = usual_step(outcome.frames)
     offsets = dict(outcome.options.offsets or {})
     late = []
+    doubtful = []
     wrong = False
     repeated = False
-    for name, delay, gain, other in zip(
+    for name, delay, gain, other, error in zip(
         outcome.inputs.sources, *outcome.solution.clocks, strict=True
     ):
-        if abs(delay) > DELAY and gain > DELAY_GAIN:
+        margin = TRUST * error
+        if not margin <= UNCERTAIN:
+            text = "unknown"
+            if margin < abs(delay) + OTHER_RATE:
+                text = f"±{step * margin:.1f}"
+            doubtful.append(f"{name} {text}")
+            wrong = wrong or (margin > OTHER_RATE and gain > OTHER_RATE_GAIN)
+        sure = margin < min(abs(delay), OTHER_RATE)
+        if sure and abs(delay) > DELAY and gain > DELAY_GAIN:
             text = f"{name} {step * delay:+.1f}"
             if np.isfinite(other):
                 repeated = True
@@ -131,8 +151,15 @@ def late_clocks(outcome: Outcome) -> LateClocks:
             late.append(text)
             wrong = wrong or abs(delay) > LATE
             offsets[name] = offsets.get(name, 0) + round(step * delay)
+    notes = []
+    if doubtful:
+        notes.append(
+            f"doubtful: how late clocks are is uncertain, in frames: {', '.join(doubtful)}; the "
+            "person moves too little, or the time of a camera runs at another rate: compare a "
+            "single event, such as a clap"
+        )
     if not late:
-        return LateClocks([], False)
+        return LateClocks(notes, wrong)
     text = ", ".join(f"{name}: {frames}" for name, frames in offsets.items())
     note = f"clocks seem late, in frames: {', '.join(late)}; set offsets={{{text}}}"
     if repeated:
@@ -140,7 +167,7 @@ def late_clocks(outcome: Outcome) -> LateClocks:
             ", if a single event such as a clap agrees: the motion repeats itself, and another "
             "delay fits nearly as well"
         )
-    return LateClocks([note], wrong)
+    return LateClocks([*notes, note], wrong)
 
 
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:

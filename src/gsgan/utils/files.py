@@ -5,6 +5,7 @@ import contextlib
 import io
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,15 @@ from typing import Any
 import numpy as np
 
 from gsgan.utils.errors import DataError
+
+# Text in quotes, which stays, or what JSON does not have: comments, and a comma before a bracket.
+JSON_TEXT = r'("(?:[^"\\]|\\.)*")'
+JSON_COMMENT = re.compile(JSON_TEXT + r"|//[^\n]*|/\*.*?\*/", re.DOTALL)
+JSON_OBJECT = re.compile(r"(\s|//[^\n]*|/\*.*?\*/)*\{", re.DOTALL)
+JSON_LAST_COMMA = re.compile(JSON_TEXT + r"|,(?=\s*[}\]])", re.DOTALL)
+# Numbers between blanks, with a point or with a comma.
+POINT_NUMBER = re.compile(r"(?<!\S)[-+]?\d*\.\d")
+COMMA_NUMBER = re.compile(r"(?<!\S)([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)(?!\S)")
 
 
 def cache_root() -> Path:
@@ -39,6 +49,13 @@ def read_text(path: Path, errors: str = "strict") -> str:
     content = path.read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return content.decode("utf-16" if wide else "utf-8-sig", errors)
+
+
+def with_decimal_points(text: str) -> str:
+    """The text, with points in place of decimal commas if none of its numbers has a point."""
+    if POINT_NUMBER.search(text):
+        return text
+    return COMMA_NUMBER.sub(r"\1.\2", text)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -114,16 +131,39 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_json_value(path: Path) -> Any:
-    """The content of a JSON file, of any type; errors as `read_json`."""
+    """The content of a JSON file, of any type; errors as `read_json`.
+
+    Comments, and commas after a last entry, which editors allow, are left out.
+    """
     # Deep nesting is a RecursionError, other damage a ValueError. From bytes, json finds out
     # whether the text is UTF-8, UTF-16 or UTF-32.
     try:
-        return json.loads(path.read_bytes())
+        content = path.read_bytes()
+        try:
+            return json.loads(content)
+        except ValueError:
+            return json.loads(_without_comments(content))
     except OSError as error:
         raise unreadable(path, error) from None
     except (ValueError, RecursionError) as error:
         refuse_empty(path)
         raise DataError(f"{path} is not valid JSON: {error}") from None
+
+
+def _without_comments(content: bytes) -> str:
+    """JSON text without comments, and without commas after the last entry of a list or object."""
+    # Line ends stay, so that an error has the line of the file.
+    text = content.decode(json.detect_encoding(content))
+
+    def blank(match: re.Match[str]) -> str:
+        return match[1] or "\n" * match[0].count("\n")
+
+    return JSON_LAST_COMMA.sub(blank, JSON_COMMENT.sub(blank, text))
+
+
+def is_json_object(head: str) -> bool:
+    """Whether the start of a file is that of a JSON object, perhaps below comments."""
+    return JSON_OBJECT.match(head) is not None
 
 
 def refuse_empty(path: Path) -> None:
