@@ -221,6 +221,10 @@ def test_mediapipe(tmp_path, landmarks, proportions, style):
             "frame 0.* 33 ",
         ),
         (
+            [{"pose_world_landmarks": [[0, 0, float("inf")]] * 33}],
+            "frame 0: expected 33 landmarks with finite",
+        ),
+        (
             [{"pose_world_landmarks": None}],
             "no joint of any frame has a position",
         ),

@@ -372,6 +372,10 @@ def test_decimal_commas_are_read_as_points(tmp_path):
     np.testing.assert_array_equal(commas.root, points.root)
     np.testing.assert_array_equal(commas.local, points.local)
 
+    path.write_text(text.replace("0.0333333", "0"))
+    with pytest.raises(DataError, match="its Frame Time is 0"):
+        read_bvh(path)
+
     # Commas that are no decimal ones are refused.
     path.write_text(text.replace("0 91 0", "0,5 1.5 0"))
     with pytest.raises(DataError, match="'0,5'"):

@@ -148,3 +148,9 @@ def test_cameras_meet_by_number_and_offset(tmp_path):
     assert px[1, 1, 0].tolist() == [30, 30]
     # nothing before frame 0
     assert gather(cameras, {"a": -1})[0].tolist() == [0, 1, 3, 4]
+
+
+def test_a_person_who_is_no_object_is_named_without_pythons_words(tmp_path):
+    (tmp_path / "0.json").write_text('{"people": [[1, 2, 3]]}')
+    with pytest.raises(DataError, match=r"\(found list\)$"):
+        read_detections(tmp_path)

@@ -33,6 +33,13 @@ def test_other_damage_of_json_is_named_with_its_line(tmp_path, text):
         read_json_value(path)
 
 
+def test_one_value_in_each_line_is_named(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text('{"a": 1}\n{"a": 2}\n')
+    with pytest.raises(DataError, match="several values follow each other"):
+        read_json_value(path)
+
+
 def test_a_calibration_below_a_comment_is_known(tmp_path):
     camera = {"K": [[9, 0, 5], [0, 9, 5], [0, 0, 1]], "t": [0, 0, 3]}
     camera |= {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "size": [10, 10]}

@@ -128,6 +128,9 @@ def make_landmarks(
         max_reach: metres from the median joint.
         notes: gains a sentence when joints are too far.
         source: file or folder, for messages.
+
+    Raises:
+        DataError: when most joints are too far.
     """
     # Missing joints have visibility 0.
     finite = np.isfinite(p).all(-1)
@@ -140,6 +143,11 @@ def make_landmarks(
         offset = np.nan_to_num(p, posinf=0, neginf=0) - centre[:, None]
         distance = np.linalg.norm(offset, axis=-1)
     far = valid & (distance > max_reach)
+    if 2 * far.sum() > valid.sum():
+        raise DataError(
+            f"{source}: joints are {np.median(distance[valid]):.3g} m from the middle of the body "
+            "in the median, which no person is; are its lengths in another unit?"
+        )
     if far.any():
         visibility[far] = 0
         notes.append(

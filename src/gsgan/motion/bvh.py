@@ -109,7 +109,9 @@ def _read_values(text: str, columns: int) -> tuple[Array, float]:
     frames = int(head[1])
     frame_time = float(head[2])
     numbers = text[head.end() :].split()
-    if frames < 1 or not frame_time > 0 or len(numbers) != frames * columns:
+    if not frame_time > 0:
+        raise ValueError(f"its Frame Time is {head[2]}")
+    if frames < 1 or len(numbers) != frames * columns:
         raise ValueError(
             f"{frames} frames of {columns} numbers, {frame_time:g} s apart, are announced, "
             f"{len(numbers)} numbers found"

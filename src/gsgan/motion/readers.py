@@ -290,10 +290,9 @@ def read_tensors(path: Path, source: Source) -> Clip:
     # Tensors and plain values only: a file from somebody else cannot run code.
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = str(error).partition("\n")[0]
+    except Exception:  # torch's own words advise to let the file run code
         raise DataError(
-            f"{path} is not a readable file of tensors ({reason}); save its "
+            f"{path} is damaged, or holds more than tensors, which could run code; save its "
             f"{GVHMR_KEY!r} as arrays with numpy.savez"
         ) from None
     expected = {GVHMR_KEY, *TRAM_KEYS, *POSE_KEYS}
@@ -767,9 +766,9 @@ def _landmark_row(where: str, frame: Any) -> Float:
     except TypeError:
         rows = []
     row = as_floats(rows)
-    if row.shape != (BODY, 4) or np.isnan(row).any():
+    if row.shape != (BODY, 4) or not np.isfinite(row).all():
         raise DataError(
-            f"{where}: expected {BODY} landmarks with x, y, z; found {len(rows)}"
+            f"{where}: expected {BODY} landmarks with finite x, y, z; found {len(rows)}"
         )
     return row
 

@@ -279,6 +279,9 @@ def _read_people(path: Path) -> list[_Person]:
 
 def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> _Person:
     """The parts of one person, whose ``keys`` are those of its program."""
+    if not isinstance(person, Mapping):
+        raise TypeError(f"found {type(person).__name__}")
+
     # OpenPose of 2017 had names without _2d.
     if not {keys[0], keys[0].removesuffix("_2d")} & person.keys():
         raise KeyError(f"found {', '.join(person)}")

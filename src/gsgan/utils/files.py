@@ -147,7 +147,10 @@ def read_json_value(path: Path) -> Any:
         raise unreadable(path, error) from None
     except (ValueError, RecursionError) as error:
         refuse_empty(path)
-        raise DataError(f"{path} is not valid JSON: {error}") from None
+        reason = str(error)
+        if reason.startswith("Extra data"):
+            reason = f"several values follow each other, expected one list of them ({reason})"
+        raise DataError(f"{path} is not valid JSON: {reason}") from None
 
 
 def _without_comments(content: bytes) -> str:
