@@ -276,6 +276,30 @@ def test_a_disturbed_calibration_comes_back_within_half_a_pixel(moved):
     assert np.median(seen_again.error) < 0.5
 
 
+def two_cameras():
+    """Two cameras, biased landmarks, and silhouettes of which one camera's are off by a pixel."""
+    rig, _, uv, conf = seen(ring(ANGLES[:2]), frames=40)
+    bias = np.random.default_rng(2).normal(0, 6, (2, 1, uv.shape[2], 2))
+    shown = uv.copy()
+    shown[1, ..., 1] += 1
+    return rig, uv + bias, conf, outlines(shown, noise=0.3)
+
+
+def test_one_pair_of_cameras_is_not_moved_by_what_masks_are_usually_off():
+    rig, uv, conf, silhouettes = two_cameras()
+    found = found_by(rig, uv, conf, silhouettes)
+    assert found.frontier[0] > 0.5
+    assert found.cameras is rig
+
+
+def test_one_pair_of_cameras_that_was_moved_is_refined():
+    rig, uv, conf, silhouettes = two_cameras()
+    given = turned(rig, 1, degrees=2.0, metres=0.05)
+    found = found_by(given, uv, conf, silhouettes)
+    before, after = found.frontier
+    assert after < 0.5 * before
+
+
 def test_landmarks_refuse_cameras_that_wrong_silhouettes_would_turn():
     """One camera's silhouettes are of something else than the person alone."""
     rig, _, uv, conf = seen(ring(), frames=30)

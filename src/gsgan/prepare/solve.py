@@ -56,6 +56,9 @@ MIN_FRONTIER = 60  # frontier points: fewer do not judge cameras
 BETTER = 0.9
 # Pixels: silhouettes, which are of whole pixels, do not judge cameras by which they agree so well.
 PIXELATION = 0.5
+# The same for two cameras, whose single pair does not average the error of masks: outlines are off
+# by so much at 90 % (docs/results/prepare.md).
+PAIR_ERROR = 1.5
 # Landmarks are biased, so they may fit better cameras worse; but in no camera by this factor: then
 # silhouettes are cut off, or of something else. An error of a thousandth of the focal length is
 # usual.
@@ -315,7 +318,8 @@ def refine(
     before = frontier_points(given, judging)
     error = float(np.nanmedian(before.error)) if before.uv.size else np.nan
     few = before.uv.shape[1] < MIN_FRONTIER
-    if settings.refinements == 0 or few or error <= PIXELATION:
+    usual = PIXELATION if len(given) > 2 else PAIR_ERROR
+    if settings.refinements == 0 or few or error <= usual:
         return Refined(given, (error, error))
 
     # The best of the refined cameras, by the frames between. Landmarks must not contradict them.
