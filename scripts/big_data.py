@@ -1,7 +1,7 @@
 """Time and memory of opening a capture of many images, and memory while images are read from it.
 
     python scripts/big_data.py [--frames 100000] [--cameras 20] [--reads 1600] [--folder DIR]
-    python scripts/big_data.py --frames 2500 --cameras 24 --size 1330 1150 --suffix jpg --workers 0 1
+    python scripts/big_data.py --frames 2500 --cameras 24 --size 1330 1150 --suffix jpg --workers 1
 
 Makes the capture: each image is a hard link to one of a few files, in a folder per camera. Prints
 processor seconds of the index and of the splits, and resident memory after every eighth of the
