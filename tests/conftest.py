@@ -179,10 +179,15 @@ def build(tiny):
 
 
 @pytest.fixture(autouse=True)
-def denormals():
-    """Training in this process flushes denormals; other tests reckon with them."""
+def settings_of_torch():
+    """Training in this process flushes denormals, with which other tests reckon.
+
+    numba, which gsply imports, gives torch a thread per core: all later tests would be several
+    times slower.
+    """
     yield
     torch.set_flush_denormal(False)
+    torch.set_num_threads(1)
 
 
 def forked(command: list[str]) -> int:

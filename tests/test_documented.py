@@ -29,27 +29,21 @@ SMALL_BENCH = {
         "data.root=/path/to/capture",
     ],
     "trade_off": [
-        *(
-            "settings.accuracies=[draft]",
-            "settings.scales=[0.5]",
-            "settings.backends=[]",
-        ),
-        *(
-            "settings.precisions=[]",
-            "settings.windows=[]",
-            "repeats=1",
-            "images=1",
-        ),
+        "settings.accuracies=[draft]",
+        "settings.scales=[0.5]",
+        "settings.backends=[]",
+        "settings.precisions=[]",
+        "settings.windows=[]",
+        "repeats=1",
+        "images=1",
     ],
     "raster": [
-        *(
-            "repeats=1",
-            "gaussians=[300]",
-            "channels=[3]",
-            "sizes=[32]",
-            "windows=1",
-            "window=16",
-        )
+        "repeats=1",
+        "gaussians=[300]",
+        "channels=[3]",
+        "sizes=[32]",
+        "windows=1",
+        "window=16",
     ],
 }
 

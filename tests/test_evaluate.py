@@ -22,16 +22,12 @@ DATA = (
     "lpips.nets=[]",
 )
 PROTOCOL = (
-    *(
-        "protocol=paper_thuman4",
-        "protocol.train_cameras=[cam00,cam01]",
-        "data.size=32",
-    ),
-    *(
-        "protocol.test_cameras=[cam02]",
-        "protocol.train_frames=0-3",
-        "protocol.test_frames=0-3",
-    ),
+    "protocol=paper_thuman4",
+    "protocol.train_cameras=[cam00,cam01]",
+    "data.size=32",
+    "protocol.test_cameras=[cam02]",
+    "protocol.train_frames=0-3",
+    "protocol.test_frames=0-3",
 )
 
 

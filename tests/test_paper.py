@@ -135,32 +135,27 @@ def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
 
 # Under the preset these are off, or say what another listed key says.
 UNLISTED = (
-    *(
-        "model.body_points",
-        "training.recipes.colour",
-        "training.registration",
-        "training.schedule.stretch",
-        "training.schedule.coarse",
-    ),
-    *(
-        "model.segmentation.hands_face",
-        "training.perceptual.width",
-        "training.perceptual.weights",
-        "training.recipes.psi.span",
-    ),
-    *("model.backend", "model.window_multiple", "model.window_minimum"),
-    *(
-        "training.seed",
-        "training.log_every",
-        "training.max_skipped",
-        "training.skip_window",
-    ),
-    *(
-        "training.rollback",
-        "training.average_every",
-        "training.perceptual.path",
-    ),
-    *("training.schedule.epoch", "effects.impossible"),
+    "model.body_points",
+    "training.recipes.colour",
+    "training.registration",
+    "training.schedule.stretch",
+    "training.schedule.coarse",
+    "model.segmentation.hands_face",
+    "training.perceptual.width",
+    "training.perceptual.weights",
+    "training.recipes.psi.span",
+    "model.backend",
+    "model.window_multiple",
+    "model.window_minimum",
+    "training.seed",
+    "training.log_every",
+    "training.max_skipped",
+    "training.skip_window",
+    "training.rollback",
+    "training.average_every",
+    "training.perceptual.path",
+    "training.schedule.epoch",
+    "effects.impossible",
 )
 
 

@@ -16,17 +16,13 @@ from gsgan.utils.errors import GsganError
 
 SCRIPTS = ROOT / "scripts" / "bench"
 SCENE = [
-    *(
-        "size=tiny",
-        "data.source.frames=2",
-        "data.source.test_frames=1",
-        "data.body=none",
-    ),
-    *(
-        "data.source.train_cameras=2",
-        "data.source.test_cameras=1",
-        "data.source.rays_per_pixel=1",
-    ),
+    "size=tiny",
+    "data.source.frames=2",
+    "data.source.test_frames=1",
+    "data.body=none",
+    "data.source.train_cameras=2",
+    "data.source.test_cameras=1",
+    "data.source.rays_per_pixel=1",
 ]
 
 

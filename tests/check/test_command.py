@@ -4,7 +4,6 @@ import base64
 import json
 import re
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from make import edit_json
 
 FEW = ("sampling.images=16", "sampling.shown=2")
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real_capture"
 
 
 @pytest.fixture
@@ -119,26 +117,3 @@ def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     )
     assert code == 1
     assert "taken/check.html cannot be written" in " ".join(output.split())
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}"
-)
-def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
-    code, output, _ = command(
-        f"data.root={REAL}", "sampling.images=40", "sampling.shown=1"
-    )
-    assert code == 0
-    assert "0 errors, 1 warning" in output
-    numbers = json.loads((tmp_path / "work" / "check.json").read_text())
-    found = {
-        finding["topic"]: finding["sentence"] for finding in numbers["findings"]
-    }
-    assert "far from their 2D detections" in found["frames"]
-    # the right foot, found flipped
-    assert set(numbers["doubtful_frames"]) == {"64", "65"}
-    for camera in numbers["cameras"].values():
-        assert camera["inside"] > 0.98
-        assert camera["overlap"] > max(camera["rivals"].values()) + 0.2
-    assert 3 < numbers["camera_distance"] < 3.5

@@ -389,26 +389,6 @@ def test_batches_need_one_size(ten_frames):
         GsganData(str(ten_frames), batch_size=2, crop="person").setup()
 
 
-# --- the real capture ---------------------------------------------------------------------------
-
-
-def test_the_real_capture_is_read_whole(real_capture):
-    data = GsganData(str(real_capture), size=128, crop="person", info_samples=4)
-    assert data.layout.camera_names == ("cam01", "cam02", "cam03", "cam04")
-    assert all(
-        list(files) == list(range(70)) for files in data.layout.images.values()
-    )
-    assert data.layout.notes == ()
-    assert len(data.dataset("train")) == 4 * 56
-    assert data.splits.test_frames == tuple(range(56, 70))
-    assert set(data.reasons) == {"novel_view"}
-    assert len(data.dataset("novel_pose")) == 4 * 14
-    assert data.info.n_train_cameras == 4
-    assert 3.4 < data.info.limb_length_sum < 4.8  # 2.4 times the stature, about
-    # white balance differs between the cameras
-    assert data.info.surface.difference > 0.03
-
-
 def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path):
     root = write_tiny_capture(tmp_path, frames=4)
     data = GsganData(str(root), workers=1)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from make import write_tiny_capture
+from writers.easymocap import write_opencv
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import numbers
@@ -22,10 +23,6 @@ from gsgan.utils.files import read_json
 from gsgan.utils.frame_files import counting
 from gsgan.utils.image_files import read_colour
 
-REPORTS = Path(__file__).parents[3] / "shared" / "data" / "reports"
-needs_reports = pytest.mark.skipif(
-    not REPORTS.is_dir(), reason="the shared files are not here"
-)
 SOFT = np.tile(np.arange(0, 256, 8, dtype=np.uint8), (24, 1))
 
 
@@ -109,42 +106,20 @@ def test_an_empty_mask_and_a_faint_soft_one_are_masks(tmp_path):
         np.testing.assert_array_equal(mask_of(tmp_path / "m.png"), values)
 
 
-@needs_reports
-def test_the_reported_masks():
-    white = next((REPORTS / "masks" / "white_alpha" / "masks").rglob("*.png"))
-    assert 0 < (mask_of(white) > 127).mean() < 0.9
-    half = next((REPORTS / "masks" / "bool_half" / "masks").rglob("*.png"))
-    with pytest.raises(DataError, match="127"):
-        mask_of(half)
-
-
 # -- calibrations
 
 
-@needs_reports
-def test_yaml_without_its_directive_is_read():
-    found = read_calibration(
-        REPORTS / "calibration" / "no_directive" / "intri.yml"
-    )
-    assert list(found.cameras) == ["cam01", "cam02", "cam03"]
-
-
-@needs_reports
-def test_a_scene_of_nerfstudio_is_read():
-    """One K for all frames, OpenGL's axes, and a unit of length that is not metres."""
-    found = read_calibration(REPORTS / "calibration" / "transforms.json")
-    assert list(found.cameras) == ["cam01", "cam02", "cam03"]
-    assert not found.metric
-    camera = found.cameras["cam01"]
-    assert camera.size == (128, 96)
-    assert tuple(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]) == (150, 150, 48, 64)
-    # The file's last column is the camera's centre, its third one points away from the scene.
-    np.testing.assert_allclose(
-        -camera.R.T @ camera.t, [0.635742, -3.136213, 1.0], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        camera.R[2], [-0.198572, 0.979588, -0.031235], atol=1e-6
-    )
+def test_yaml_without_its_directive_is_read(tmp_path):
+    names = ["cam01", "cam02"]
+    matrices = {"K": np.eye(3), "R": np.zeros((3, 1)), "T": np.zeros((3, 1))}
+    for file, keys in (("intri.yml", "K"), ("extri.yml", "RT")):
+        values = {
+            f"{key}_{name}": matrices[key] for name in names for key in keys
+        }
+        write_opencv(tmp_path / file, names, values)
+        _, rest = (tmp_path / file).read_text().split("\n", 1)
+        (tmp_path / file).write_text(rest)
+    assert list(read_calibration(tmp_path / "intri.yml").cameras) == names
 
 
 # -- landmarks
@@ -254,23 +229,6 @@ def test_25_joints_without_hips_are_doubtful(tmp_path):
         tmp_path / "others", [{"pose_keypoints_2d": triples(18)}]
     )
     assert read_detections(others).notes == ()
-
-
-@needs_reports
-def test_the_reported_detections():
-    nobody = read_detections(
-        REPORTS / "detections" / "null_person" / "cam01_json"
-    )
-    assert nobody.px.shape[0] > 0
-    old = read_detections(
-        REPORTS / "prepare" / "landmarks" / "old_keys" / "cam01_json"
-    )
-    assert (old.conf[:, [11, 12, 23, 24]] > 0).all()
-    other = read_detections(
-        REPORTS / "prepare" / "landmarks" / "body_25b" / "cam01_json"
-    )
-    both = np.isfinite(old.px).all(-1) & np.isfinite(other.px).all(-1)
-    assert np.abs(old.px - other.px)[both].max() < 2  # the same person
 
 
 def test_masks_of_another_suffix_are_named(tmp_path):

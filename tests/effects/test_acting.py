@@ -182,7 +182,9 @@ def test_paintings_follow_the_lens_with_every_map(build, tmp_path):
         splits={"train_cameras": ["cam00", "cam01"], "test_cameras": ["cam02"]},
     )  # fmt: skip
     data, avatar, _ = build(
-        *(f"data.root={bent}", "data.size=64", "effects.distortion=project"),
+        f"data.root={bent}",
+        "data.size=64",
+        "effects.distortion=project",
         "model.low_pass=0.3",  # untrained points are sparse: with less there are gaps
         "model.supersample=1",
     )

@@ -23,8 +23,8 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import spread_frames
 from gsgan.evaluate.origin import fingerprint
 from gsgan.evaluate.run import ScoreOptions, make_scorer
-from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.frames import MaskedFrames, rotate_cameras
+from gsgan.fit.fitter import Fitter
+from gsgan.fit.frames import MaskedFrames, Silhouette, rotate_cameras
 from gsgan.fit.run import fit_before_training, refuse_other_fit
 from gsgan.fit.shape import fit_shape
 from gsgan.run.assemble import AvatarSettings
@@ -350,25 +350,48 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
     with pytest.raises(DataError):
         run_fit(
             compose(
-                *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
+                "fit",
+                f"data.root={empty}",
+                f"out={tmp_path / 'a'}",
+                *QUICK,
                 "data.reader.consistency.frames=0",
             )
         )
 
 
-def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
+def test_outside_the_image_alpha_costs_nothing(
+    people, tmp_path, compose, monkeypatch
+):
     """Pixels of a window outside the camera's image are ignored, and the fit ignores them."""
     oblong = write_tiny_capture(
         tmp_path / "oblong", cameras=2, frames=2, size=(96, 64)
     )
-    data = GsganData(str(oblong), size=48)
-    frames = MaskedFrames(data, torch.device("cpu"))
-    frame = frames.silhouettes(0)[0]
+    frame = MaskedFrames(
+        GsganData(str(oblong), size=48), torch.device("cpu")
+    ).silhouettes(0)[0]
     beyond = frame.ignored > 0.5
     assert beyond.float().mean() == pytest.approx(1 / 3)
     assert float(frame.mask[beyond].max()) == 0
-    everything = torch.ones_like(frame.mask)
-    assert float(_wrong(everything, frame)[beyond].max()) == 0
+
+    # Whatever the masks are there, the surface becomes the same.
+    read = MaskedFrames.silhouettes
+
+    def fill(frames: MaskedFrames, i: int) -> list[Silhouette]:
+        return [
+            seen
+            if seen.ignored is None
+            else replace(seen, mask=torch.maximum(seen.mask, seen.ignored))
+            for seen in read(frames, i)
+        ]
+
+    weights = []
+    for silhouettes in (read, fill):
+        monkeypatch.setattr(MaskedFrames, "silhouettes", silhouettes)
+        fitter = ready(oblong, compose)
+        fitter.surface_step()
+        weights.append(list(fitter.surface.parameters()))
+    torch.testing.assert_close(*weights, rtol=0, atol=0)
+    monkeypatch.setattr(MaskedFrames, "silhouettes", read)
     inside = GsganData(str(people), size=48)
     assert (
         MaskedFrames(inside, torch.device("cpu")).silhouettes(0)[0].ignored

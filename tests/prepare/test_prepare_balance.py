@@ -59,14 +59,13 @@ def test_real_videos_become_a_capture_that_trains(tmp_path, check):
     )
     done = subprocess.run(
         [
-            *(
-                sys.executable,
-                "-m",
-                "gsgan.train",
-                "data=capture",
-                f"data.root={out}",
-            ),
-            *("experiment=smoke", f"hydra.run.dir={tmp_path / 'run'}"),
+            sys.executable,
+            "-m",
+            "gsgan.train",
+            "data=capture",
+            f"data.root={out}",
+            "experiment=smoke",
+            f"hydra.run.dir={tmp_path / 'run'}",
         ],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,

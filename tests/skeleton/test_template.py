@@ -18,8 +18,14 @@ def test_counts():
     assert len(T.limbs) == len(set(T.limbs)) == 22
     assert len(T.gnn_edges) == 39
     assert [name for name, _ in T.draw_groups] == [
-        *("head", "torso", "left_arm", "right_arm"),
-        *("left_hand", "right_hand", "left_leg", "right_leg"),
+        "head",
+        "torso",
+        "left_arm",
+        "right_arm",
+        "left_hand",
+        "right_hand",
+        "left_leg",
+        "right_leg",
     ]
 
 

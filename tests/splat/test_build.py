@@ -169,8 +169,13 @@ def test_a_wheel_with_kernels_has_the_platforms_name_and_every_function(
 ):
     subprocess.run(
         [
-            *(sys.executable, "-m", "build", "--wheel"),
-            *("--outdir", str(tmp_path), str(Path(__file__).parents[2])),
+            sys.executable,
+            "-m",
+            "build",
+            "--wheel",
+            "--outdir",
+            str(tmp_path),
+            str(Path(__file__).parents[2]),
         ],
         env={**os.environ, "GSGAN_WHEEL_KERNELS": "1"},
         check=True,

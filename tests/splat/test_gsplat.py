@@ -369,7 +369,9 @@ class Newer(StandIn):
         ),
         (
             broken(RuntimeError("no kernel image\nfor this device")),
-            *("cpu", "float32", [BROKEN, "(RuntimeError: no kernel image)"]),
+            "cpu",
+            "float32",
+            [BROKEN, "(RuntimeError: no kernel image)"],
         ),
         (
             broken(AssertionError()),

@@ -109,7 +109,9 @@ def test_values_and_gradients_are_right(backend, accuracy, drawn):
     # An alpha that rounding takes across alpha_min shows where a gradient is all but 0, and below
     # 1e-38 float32 has few digits.
     case = raster_case(
-        *("scenes", "random", lambda: scene),
+        "scenes",
+        "random",
+        lambda: scene,
         size=size,
         settings=accuracy,
         tolerance=Tolerance(2e-5, 3e-3),

@@ -171,8 +171,8 @@ class Bones:
     joints: np.ndarray
 
 
-def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
-    """An AMC motion with Mixamo's bone names, Z up; each ``every``-th frame."""
+def recorded(path: Path) -> tuple[Bones, Animation]:
+    """An AMC motion with Mixamo's bone names, Z up."""
     rig, metres = read_amc(path, asf_of(path))
     known = {j: bone for bone, j in find_joints(rig.names).items()}
 
@@ -199,8 +199,8 @@ def recorded(path: Path, every: int) -> tuple[Bones, Animation]:
     parents = [kept.index(above(j)) if above(j) >= 0 else -1 for j in kept]
     B = Y_UP.T
     moved = Animation(
-        B @ rig.rotations[::every][:, kept] @ B.T,
-        metres * rig.pose()[::every][:, kept] @ B.T,
+        B @ rig.rotations[:, kept] @ B.T,
+        metres * rig.pose()[:, kept] @ B.T,
         {},
         (),
     )

@@ -19,7 +19,7 @@ from gsgan.synthetic.scene_setup import load_character
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter
 
 STEP = 1 / 30
-CMU = Path(__file__).parents[3] / "shared/data/motion/cmu"
+RUN = Path(__file__).parents[1] / "motion" / "files" / "02_03.amc"
 LIMBS, FEET = [*range(11, 17), *range(23, 29)], [*range(29, 33)]  # landmarks
 
 
@@ -71,21 +71,10 @@ def test_landmarks_agree_and_the_subject_moves_alike(
     assert np.abs(read.joints - expected.joints).max() < 1e-3
 
 
-@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
-@pytest.mark.parametrize(
-    "clip",  # running, climbing, uneven ground
-    [
-        "02_03",
-        *(
-            pytest.param(clip, marks=pytest.mark.slow)
-            for clip in ("01_14", "03_01")
-        ),
-    ],
-)
-def test_recorded_motions_agree(tmp_path, source, clip):
+def test_recorded_motions_agree(tmp_path, source):
     """Joints of the limbs do, whatever is known of the zero pose; other landmarks are near."""
-    rig, motion = recorded(CMU / f"{clip}.amc", 12)
-    direct = read_motion(CMU / f"{clip}.amc", source).p[::12]
+    rig, motion = recorded(RUN)
+    direct = read_motion(RUN, source).p
     for name, options in CONVENTIONS.items():
         path = write_bvh(tmp_path / f"{name}.bvh", rig, motion, 0.1, **options)
         p = read_motion(path, source).p
@@ -94,10 +83,9 @@ def test_recorded_motions_agree(tmp_path, source, clip):
         assert np.median(away[:, FEET]) < 0.05, name
 
 
-@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
 def test_one_frame_of_a_run(tmp_path, source):
     """A foot in the air is not taken for a flat one."""
-    rig, motion = recorded(CMU / "02_03.amc", 12)
+    rig, motion = recorded(RUN)
     one = Animation(motion.rotations[:1], motion.joints[:1], {}, ())
     p, expected = (
         read_motion(
@@ -111,11 +99,9 @@ def test_one_frame_of_a_run(tmp_path, source):
     assert away[:, FEET].max() < 0.2
 
 
-@pytest.mark.skipif(not CMU.is_dir(), reason="no motion files here")
 def test_resting_feet_of_splayed_rigs_are_flat():
     """CMU's zero pose stands with legs apart and with soles at right angles to them."""
-    path = CMU / "02_03.amc"
-    turns = standard_motion(read_amc(path, asf_of(path))[0], path).turns
+    turns = standard_motion(read_amc(RUN, asf_of(RUN))[0], RUN).turns
     for side in SIDES:
         assert (
             np.degrees(np.abs(np.arcsin(turns[side + "Foot"][:, 2, 0]))).mean()

@@ -312,29 +312,21 @@ def test_key_depends_on_every_parameter():
     changed = [
         SceneSettings(**{name: value})
         for name, value in (
-            *(
-                ("size", 64),
-                ("train_cameras", 5),
-                ("test_cameras", 1),
-                ("frames", 61),
-            ),
-            *(
-                ("test_frames", 14),
-                ("rays_per_pixel", 5),
-                ("seed", 1),
-                ("avatar", "free_body"),
-            ),
-            *(
-                ("secondary", False),
-                ("lens", (0.1, 0, 0, 0)),
-                ("lens", (0.1, 0, 0, 0, 0)),
-            ),
-            *(
-                ("tint", 0.1),
-                ("tint", 0.2),
-                ("gloss", 0.1),
-                ("test_scale", (2.0,)),
-            ),
+            ("size", 64),
+            ("train_cameras", 5),
+            ("test_cameras", 1),
+            ("frames", 61),
+            ("test_frames", 14),
+            ("rays_per_pixel", 5),
+            ("seed", 1),
+            ("avatar", "free_body"),
+            ("secondary", False),
+            ("lens", (0.1, 0, 0, 0)),
+            ("lens", (0.1, 0, 0, 0, 0)),
+            ("tint", 0.1),
+            ("tint", 0.2),
+            ("gloss", 0.1),
+            ("test_scale", (2.0,)),
         )
     ]
     changed.append(SceneSettings(test_scale=(2.0,), tint=0.1))

@@ -124,16 +124,13 @@ def gradients(module: AvatarTraining) -> set[str]:
 
 
 ONE_EACH = (
-    *("training.schedule.segmentation=1", "training.schedule.step_one=1"),
-    *(
-        "training.schedule.step_two=1",
-        "training.schedule.discriminator_start=0",
-    ),
-    *(
-        "training.schedule.degree_every=0",
-        "training.average=null",
-        "effects=all",
-    ),
+    "training.schedule.segmentation=1",
+    "training.schedule.step_one=1",
+    "training.schedule.step_two=1",
+    "training.schedule.discriminator_start=0",
+    "training.schedule.degree_every=0",
+    "training.average=null",
+    "effects=all",
 )
 
 

@@ -97,9 +97,9 @@ def test_psis_rate_ends_with_step_one_however_long_step_two_is(make):
         module, _, _ = make("training=paper", "training.schedule.segmentation=0",
                             "training.schedule.step_one=10", f"training.schedule.step_two={two}",
                             "training.perceptual.weights=random")  # fmt: skip
-        rates[two] = []
-        for module.step in (0, 5, 10, 15):
-            rates[two].append(module._rate("psi"))
+        recipe = module.recipes["psi"]
+        span = module.schedule.span("psi", recipe.span)
+        rates[two] = [recipe.rate.at(step, *span) for step in (0, 5, 10, 15)]
     assert rates[6] == rates[60]
     assert rates[6][0] == pytest.approx(1e-3)
     assert rates[6][1] == pytest.approx(1e-4)  # half-way, exponentially

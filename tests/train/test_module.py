@@ -103,15 +103,41 @@ def test_variants_build_only_what_they_use(make):
 def test_randomness_follows_from_seed_and_step(make):
     module, _, data = make("effects.random_background=on")
     frame = data.dataset("train")[0]
-    first = module._background(frame), module._pose_noise(frame.skeleton)
-    again = module._background(frame), module._pose_noise(frame.skeleton)
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    module.step = 1
-    assert not torch.equal(module._background(frame), first[0])
-    module.step, module.seed = 0, 1
-    assert not torch.equal(module._pose_noise(frame.skeleton), first[1])
+    with torch.no_grad():
+        rendering = module.avatar(*frame.inputs)
+
+    def loss(step: int, seed: int) -> float:
+        """Before the background of this iteration."""
+        module.step, module.seed = step, seed
+        return float(module.step_one_loss(rendering, frame).detach())
+
+    assert loss(0, 0) == loss(0, 0)
+    assert len({loss(0, 0), loss(1, 0), loss(0, 1)}) == 3
     module.random_background = False
-    assert module._background(frame) is None
+    assert loss(0, 0) == loss(1, 0)
+
+
+def test_noise_of_poses_follows_from_seed_and_step(make):
+    def noises(seed: int) -> list[torch.Tensor]:
+        """Of the iterations of Step I."""
+        module, trainer, data = make(
+            f"seed={seed}",
+            "training.schedule.segmentation=0",
+            "training.schedule.step_one=2",
+            "training.schedule.step_two=0",
+        )
+        given = []
+        module.avatar.register_forward_pre_hook(
+            lambda _, args, named: given.append(named["pose_noise"]),
+            with_kwargs=True,
+        )
+        trainer.fit(module, data)
+        return given
+
+    first, again, other = noises(0), noises(0), noises(1)
+    assert all(map(torch.equal, first, again))
+    assert not torch.equal(first[0], first[1])
+    assert not torch.equal(first[0], other[0])
 
 
 # --- S without labels
@@ -272,14 +298,11 @@ def test_the_discriminators_rate_spans_the_gan_alone(make):
         "training.schedule.discriminator_start=20",
     )
     start, end = module.schedule.adversarial_span
-    recipe = module.recipes["discriminator"].rate
-    rates = []
-    for module.step in (start, end - 1):
-        rates.append(module._rate("discriminator"))
-    assert rates[0] == recipe.peak
-    assert (
-        rates[1] < 0.2 * recipe.peak
-    )  # it fell within the GAN phase, not before
+    recipe = module.recipes["discriminator"]
+    span = module.schedule.span("discriminator", recipe.span)
+    assert recipe.rate.at(start, *span) == recipe.rate.peak
+    # it falls within the GAN phase, not before
+    assert recipe.rate.at(end - 1, *span) < 0.2 * recipe.rate.peak
 
 
 def test_a_comparing_gan_runs_the_discriminator_in_full_precision():

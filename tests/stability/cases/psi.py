@@ -128,7 +128,9 @@ def cases() -> Iterator[Case]:
     camera = pinhole(focal=20.0, axis_angle=(math.pi, 0, 0), t=(0.0, 0.85, 2.6))
     for name, p in (("the rest pose", rest()), ("an ordinary pose", noisy(5))):
         yield raster_case(
-            *("Ψ", f"step 0 on {name}", partial(dict, p=p, **camera)),
+            "Ψ",
+            f"step 0 on {name}",
+            partial(dict, p=p, **camera),
             draw=_step_zero,
             note="Exactly densify's Gaussians, grey and half transparent; only limbs shorter than "
             "5 mm start wider, at the least scale.",
