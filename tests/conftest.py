@@ -16,6 +16,7 @@ import hypothesis
 import numpy as np
 import pytest
 import torch
+from commands import entry_module, forked
 from omegaconf import DictConfig
 
 import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
@@ -118,17 +119,6 @@ def compose():
     return lambda name, *overrides: copy.deepcopy(composed(name, *overrides))
 
 
-def entry_module(command: str) -> str:
-    """The module that ``python -m gsgan.<command>`` runs."""
-    name = f"gsgan.{command}"
-    spec = importlib.util.find_spec(name)
-    return (
-        name
-        if spec is None or spec.submodule_search_locations is None
-        else f"{name}.__main__"
-    )
-
-
 TINY = (
     "size=tiny",
     "training=smoke",
@@ -188,32 +178,6 @@ def settings_of_torch():
     yield
     torch.set_flush_denormal(False)
     torch.set_num_threads(1)
-
-
-def forked(command: list[str]) -> int:
-    """The exit status of a sweep's job, run by a child that has imported everything already."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    sys.stdout.flush()
-    child = os.fork()
-    if not child:
-        GlobalHydra.instance().clear()  # the sweep's
-        sys.argv, code = [command[2], *command[3:]], 1
-        try:
-            importlib.import_module(
-                entry_module(command[2].removeprefix("gsgan."))
-            ).main()
-            code = 0
-        except SystemExit as end:
-            code = (
-                end.code
-                if isinstance(end.code, int)
-                else int(end.code is not None)
-            )
-        finally:
-            sys.stdout.flush()
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 @pytest.fixture
