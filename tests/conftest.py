@@ -189,6 +189,10 @@ def inside(tmp_path, monkeypatch, capfd):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("COLUMNS", "120")
         monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
+        # Hydra composes the config twice, first for this mode, which no config here sets
+        monkeypatch.setattr(
+            "hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None
+        )
         # tests of memory in this process need it given back
         monkeypatch.setattr(
             "gsgan.utils.tensors.keep_freed_memory", lambda: None
