@@ -1,5 +1,7 @@
 """Runs commands as a user does, for the tests of entry points."""
 
+import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -78,3 +80,40 @@ def stored(module, folder):
     module.on_save_checkpoint(checkpoint)
     (folder / CHECKPOINT).parent.mkdir()
     torch.save(checkpoint, folder / CHECKPOINT)
+
+
+def entry_module(command: str) -> str:
+    """The module that ``python -m gsgan.<command>`` runs."""
+    name = f"gsgan.{command}"
+    spec = importlib.util.find_spec(name)
+    return (
+        name
+        if spec is None or spec.submodule_search_locations is None
+        else f"{name}.__main__"
+    )
+
+
+def forked(command: list[str]) -> int:
+    """The exit status of a sweep's job, run by a child that has imported everything already."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    sys.stdout.flush()
+    child = os.fork()
+    if not child:
+        GlobalHydra.instance().clear()  # the sweep's
+        sys.argv, code = [command[2], *command[3:]], 1
+        try:
+            importlib.import_module(
+                entry_module(command[2].removeprefix("gsgan."))
+            ).main()
+            code = 0
+        except SystemExit as end:
+            code = (
+                end.code
+                if isinstance(end.code, int)
+                else int(end.code is not None)
+            )
+        finally:
+            sys.stdout.flush()
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

@@ -16,6 +16,7 @@ import hypothesis
 import numpy as np
 import pytest
 import torch
+from commands import entry_module, forked
 from omegaconf import DictConfig
 
 import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
@@ -118,17 +119,6 @@ def compose():
     return lambda name, *overrides: copy.deepcopy(composed(name, *overrides))
 
 
-def entry_module(command: str) -> str:
-    """The module that ``python -m gsgan.<command>`` runs."""
-    name = f"gsgan.{command}"
-    spec = importlib.util.find_spec(name)
-    return (
-        name
-        if spec is None or spec.submodule_search_locations is None
-        else f"{name}.__main__"
-    )
-
-
 TINY = (
     "size=tiny",
     "training=smoke",
@@ -190,32 +180,6 @@ def settings_of_torch():
     torch.set_num_threads(1)
 
 
-def forked(command: list[str]) -> int:
-    """The exit status of a sweep's job, run by a child that has imported everything already."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    sys.stdout.flush()
-    child = os.fork()
-    if not child:
-        GlobalHydra.instance().clear()  # the sweep's
-        sys.argv, code = [command[2], *command[3:]], 1
-        try:
-            importlib.import_module(
-                entry_module(command[2].removeprefix("gsgan."))
-            ).main()
-            code = 0
-        except SystemExit as end:
-            code = (
-                end.code
-                if isinstance(end.code, int)
-                else int(end.code is not None)
-            )
-        finally:
-            sys.stdout.flush()
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-
-
 @pytest.fixture
 def inside(tmp_path, monkeypatch, capfd):
     """Runs a command in this process, a sweep's jobs in forks: saves the seconds of imports."""
@@ -225,6 +189,10 @@ def inside(tmp_path, monkeypatch, capfd):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("COLUMNS", "120")
         monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
+        # Hydra composes the config twice, first for this mode, which no config here sets
+        monkeypatch.setattr(
+            "hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None
+        )
         # tests of memory in this process need it given back
         monkeypatch.setattr(
             "gsgan.utils.tensors.keep_freed_memory", lambda: None

@@ -86,7 +86,7 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
         gsgan.load(tmp_path)
     (tmp_path / ".hydra").mkdir()
     shutil.copy(run / CONFIG, tmp_path / CONFIG)
-    with pytest.raises(DataError, match="the run has no checkpoint yet"):
+    with pytest.raises(DataError, match="no checkpoint"):
         gsgan.load(tmp_path)
 
 

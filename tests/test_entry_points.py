@@ -1,7 +1,9 @@
 """The commands as a user types them: real processes, tiny runs, and every way to go wrong."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -10,9 +12,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import ENVIRONMENT, ROOT, arguments, refused
+from commands import ROOT, arguments, forked, refused
 
 import gsgan.__main__
+from gsgan.train.module import AvatarTraining
 
 METRICS = {"psnr", "ssim", "lpips_vgg", "lpips_alex", "edge_f1", "miou"}
 
@@ -145,27 +148,25 @@ def test_the_list_of_commands(tmp_path):
     assert "gsgan.evaluate" in result.stdout
 
 
-def test_one_program_runs_every_command(tmp_path, inside, monkeypatch):
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules.*:RuntimeWarning")
+def test_one_program_runs_every_command(inside, monkeypatch, capfd):
     """``gsgan train`` is ``python -m gsgan.train``: the same output, the same status."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     target = EntryPoint("gsgan", project["scripts"]["gsgan"], "console_scripts")
     assert target.load() is gsgan.__main__.main
 
     for words in (("demo", "--help"), ("render", "run=nowhere")):
-        command, *rest = words
-        done = subprocess.run(
-            [sys.executable, "-m", "gsgan", *words],
-            cwd=tmp_path,
-            env=ENVIRONMENT,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert vars(inside(command, *rest)) == {
-            "returncode": done.returncode,
-            "stdout": done.stdout,
-            "stderr": done.stderr,
-        }
+        plain = inside(*words)
+        monkeypatch.setattr(sys, "argv", ["gsgan", *words])
+        code = 0
+        try:
+            gsgan.__main__.main()
+        except SystemExit as end:
+            code = end.code or 0
+        out, err = capfd.readouterr()
+        given = {"returncode": code, "stdout": out, "stderr": err}
+        assert given == vars(plain)
+        assert out + err
     monkeypatch.setattr(sys, "argv", ["gsgan", "nonsense"])
     with pytest.raises(SystemExit, match=r"gsgan\.nonsense is not a command"):
         gsgan.__main__.main()
@@ -181,31 +182,23 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
-KILL = """
-import os, signal, sys
-from gsgan.train.module import AvatarTraining
-from gsgan.train.__main__ import main
-step = AvatarTraining.training_step
-def dying(self, *args):
-    if self.step == 10:  # in the middle of the third of four epochs
-        os.kill(os.getpid(), signal.SIGKILL)
-    return step(self, *args)
-AvatarTraining.training_step = dying
-main()
-"""
-
-
 def test_killed_half_way_and_resumed_ends_with_the_same_weights(
-    run, capture, tmp_path, inside
+    run, capture, tmp_path, inside, monkeypatch
 ):
     """So the same seed gives the same numbers: `run` was trained in another process."""
     folder = tmp_path / "killed"
     given = [*arguments(capture, folder), "evaluate=false"]
-    killed = subprocess.run(
-        [sys.executable, "-c", KILL, *given],
-        cwd=tmp_path, env=ENVIRONMENT, capture_output=True, timeout=300,
-    )  # fmt: skip
-    assert killed.returncode == -9
+    step = AvatarTraining.training_step
+
+    def dying(self, *args):
+        if self.step == 10:  # in the middle of the third of four epochs
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(AvatarTraining, "training_step", dying)
+        killed = forked([sys.executable, "-m", "gsgan.train", *given])
+    assert killed == -signal.SIGKILL
     assert not (folder / "metrics.json").exists()
     assert (
         torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)[

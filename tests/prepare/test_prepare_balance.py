@@ -16,7 +16,8 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.mediapipe import READY, environment_of
 from gsgan.prepare.run import prepare
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
+# a folder with the videos of Pose2Sim's demo and of caliscope's tests
+DATA = Path(os.environ.get("GSGAN_REAL_VIDEOS", "nowhere"))
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(

@@ -149,7 +149,7 @@ def test_people_that_cannot_be_joined_are_named_and_not_the_calibration():
     wrong = [cameras[0]]
     for camera, metres in zip(cameras[1:], (1.0, -1.0), strict=True):
         wrong.append(replace(camera, t=camera.t + np.array([0, metres, 0])))
-    with pytest.raises(DataError, match="several people were detected in 12"):
+    with pytest.raises(DataError, match=r"several people .* 12"):
         one_person(given, wrong, {})
 
 

@@ -96,9 +96,7 @@ def test_the_numbers_have_every_stage_and_the_dataset_is_checked(
 def test_a_camera_with_one_image_is_an_error(project):
     for path in sorted((project / "masks" / "cam01").iterdir())[1:]:
         path.unlink()
-    with pytest.raises(
-        DataError, match=r"cam01 has images with a mask in 1 of"
-    ):
+    with pytest.raises(DataError, match=r"cam01 .* mask in 1 of"):
         prepare(options(project), quiet())
 
 

@@ -300,7 +300,7 @@ def test_alpha_of_vertices_does_not_count_in_opaque_materials(tmp_path, tiny):
 def test_damage_is_named_in_plain_words(tmp_path):
     glb = TinyGlb()
     glb.doc.images[0] = pygltflib.Image(uri="data:image/png;base64,AAAA")
-    with pytest.raises(DataError, match="image of texture 0 cannot be read"):
+    with pytest.raises(DataError, match="texture 0"):
         read_character(glb.write(tmp_path / "image.glb"))
     glb = TinyGlb()
     glb.doc.meshes[0].primitives[0].attributes.WEIGHTS_0 = None
