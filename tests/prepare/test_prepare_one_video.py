@@ -278,6 +278,8 @@ def test_phones_videos_of_10_bits_are_read_and_hdr_is_named(
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
     assert read_metadata(path).hdr == said
+    if said == "HLG":  # read as PQ is; OpenCV takes five seconds for either
+        return
     recording, times = sample(path, tmp_path / "frames")
     found = cv2.imread(str(recording.files[0]))[24, 32]
     assert len(times) == 3

@@ -44,15 +44,20 @@ def built(config):
     return build_avatar(config, replace(SCENE, skeleton=skeleton))
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_full_is_full_at_every_size_and_on_all_data(compose, size):
-    for data in DATA:
-        config = compose("train", "model=full", f"size={size}", f"data={data}")
-        avatar = built(config)
-        assert isinstance(avatar.generator, Generator), data
-        assert avatar.segmentation is not None, data
-        assert avatar.pose_encoder is not None, data
-        assert config.training.discriminator is not None, data
+@pytest.mark.parametrize(
+    ("size", "data"),
+    [
+        *((size, "capture") for size in SIZES),
+        *(("tiny", data) for data in DATA),
+    ],
+)
+def test_full_is_full_at_every_size_and_on_all_data(compose, size, data):
+    config = compose("train", "model=full", f"size={size}", f"data={data}")
+    avatar = built(config)
+    assert isinstance(avatar.generator, Generator)
+    assert avatar.segmentation is not None
+    assert avatar.pose_encoder is not None
+    assert config.training.discriminator is not None
 
 
 @pytest.mark.parametrize("data", DATA)
