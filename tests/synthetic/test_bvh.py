@@ -233,7 +233,7 @@ def two_people(text: str) -> str:
         (lambda text: text.replace("Frames: 60", "Frames: 61"), "61 frames"),
         (
             lambda text: text.replace("Frame Time: 0.0", "Frame Time: nan 0.0"),
-            "numbers",
+            "Frame Time is nan",
         ),
         (
             lambda text: text[:-30] + " nan" + text[-20:],

@@ -425,7 +425,9 @@ class Tally:
             measures=prepare.measures,
             lpips=lpips,
         )
-        scores = map_threads(score, images.values())
+        # A GPU computes one after the other.
+        map_images = map_threads if target.device.type == "cpu" else map
+        scores = map_images(score, images.values())
         for (name, image), variant_scores in zip(
             images.items(), scores, strict=True
         ):
